@@ -1,0 +1,42 @@
+# make setup | demo | test | lint | benchmark | clean          (PYTHON=python3.12 make setup takes another interpreter)
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+# One thread a test process: two of them share the machine, and sums then have the same order everywhere.
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: setup demo test lint format benchmark clean
+
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "skyfix needs Python 3.11 or newer, $(PYTHON) is $$($(PYTHON) --version 2>&1); try PYTHON=python3.11 make setup" >&2; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -q -c constraints.txt setuptools
+	$(BIN)/pip install -q -c constraints.txt --no-build-isolation -e '.[dev]'
+	@touch $@
+
+demo: setup
+	$(BIN)/skyfix demo
+
+test: setup
+	$(BIN)/python -m pytest -q -n 2
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+benchmark: setup
+	$(BIN)/skyfix benchmark
+
+clean:
+	rm -rf build dist runs *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find fusion learned sequences tests -name __pycache__ -type d -prune -exec rm -rf {} +
