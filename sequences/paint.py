@@ -1,0 +1,53 @@
+"""Painting of metric shapes into rasters with sub-pixel accuracy: the only place where map metres meet OpenCV's pixels.
+
+OpenCV puts pixel centres at integers, the project at +0.5 (`fusion.grid`); the shift is taken out here. Coordinates are passed in
+fixed point with `SHIFT` fractional bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.grid import MapGrid
+
+SHIFT = 4
+_SCALE = 1 << SHIFT
+_LIMIT = 1 << 26
+
+Raster = NDArray[Any]
+
+
+def fixed_point(grid: MapGrid, xy: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Map-frame points (N, 2) as OpenCV (column, row) in fixed point, shape (N, 1, 2)."""
+    rc = grid.pixel_from_xy(np.asarray(xy, dtype=np.float64).reshape(-1, 2)) - 0.5
+    return np.clip(np.rint(rc[:, None, ::-1] * _SCALE), -_LIMIT, _LIMIT).astype(np.int32)
+
+
+def fill(raster: Raster, grid: MapGrid, rings: Sequence[NDArray[np.float64]], value: float) -> None:
+    """Fill one polygon; further rings are holes (even-odd rule)."""
+    cv2.fillPoly(raster, [fixed_point(grid, ring) for ring in rings], float(value), shift=SHIFT)
+
+
+def stroke(raster: Raster, grid: MapGrid, xy: NDArray[np.float64], value: float, width_m: float = 0.0) -> None:
+    """Draw a polyline (N, 2); width 0 is a line of one pixel."""
+    thickness = max(1, round(width_m / grid.metres_per_pixel))
+    cv2.polylines(raster, [fixed_point(grid, xy)], False, float(value), thickness=thickness, shift=SHIFT)
+
+
+def disc(raster: Raster, grid: MapGrid, xy: NDArray[np.float64], radius_m: float, value: float) -> None:
+    """Fill a circle about one point (2,); at least the pixel that it is in."""
+    centre = fixed_point(grid, xy)[0, 0]
+    radius = round(radius_m / grid.metres_per_pixel * _SCALE)
+    cv2.circle(raster, (int(centre[0]), int(centre[1])), radius, float(value), thickness=-1, shift=SHIFT)
+
+
+def box_corners(pose: NDArray[np.float64], length_m: float, width_m: float) -> NDArray[np.float64]:
+    """Corners (4, 2) of a rectangle centred on `pose` (x, y, yaw), its length along yaw."""
+    half = 0.5 * np.array([[length_m, width_m], [-length_m, width_m], [-length_m, -width_m], [length_m, -width_m]])
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    return pose[:2] + half @ np.array([[cos, sin], [-sin, cos]])
