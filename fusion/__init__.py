@@ -1,0 +1,27 @@
+"""Fusion of map-localization likelihoods with odometry: poses, likelihoods, a particle filter and a factor graph.
+
+This package knows nothing of networks, sensors or files, so that any likelihood and any odometry can be plugged in.
+"""
+
+from fusion.errors import SkyfixError
+from fusion.estimate import Estimate
+from fusion.grid import MapGrid
+from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
+from fusion.location_orientation import LocationOrientationMaps
+from fusion.modes import GaussianMixture, find_modes
+from fusion.prior import UniformPrior
+from fusion.trajectory import Trajectory
+
+__all__ = [
+    "Estimate",
+    "GaussianMixture",
+    "LikelihoodVolume",
+    "LocationOrientationMaps",
+    "MapGrid",
+    "OutlierMixture",
+    "PoseLikelihood",
+    "SkyfixError",
+    "Trajectory",
+    "UniformPrior",
+    "find_modes",
+]
