@@ -5,10 +5,11 @@ This package knows nothing of networks, sensors or files, so that any likelihood
 
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
+from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
-from fusion.modes import GaussianMixture, find_modes
+from fusion.modes import find_modes
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 

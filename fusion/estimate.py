@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from fusion.arrays import FloatArray
-from fusion.modes import GaussianMixture
+from fusion.gaussian_mixture import GaussianMixture
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,9 +14,10 @@ from scipy.special import logsumexp
 from fusion import se2
 from fusion.arrays import BoolArray, Float32Array, FloatArray, checked, read_only
 from fusion.errors import SkyfixError
+from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.interpolation import corners
-from fusion.modes import GaussianMixture, circular_run, find_modes
+from fusion.modes import circular_run, find_modes
 
 DEFAULT_FLOOR = -40.0
 

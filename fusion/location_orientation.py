@@ -12,10 +12,10 @@ from scipy.special import logsumexp
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray, checked, read_only
 from fusion.errors import SkyfixError
+from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.interpolation import corners
 from fusion.likelihood import DEFAULT_FLOOR, LikelihoodVolume, OutlierMixture, checked_temperature
-from fusion.modes import GaussianMixture
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.special import logsumexp
 
 from fusion import se2
-from fusion.arrays import BoolArray, Float32Array, FloatArray, IntArray, checked, read_only
+from fusion.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from fusion.errors import SkyfixError
+from fusion.gaussian_mixture import GaussianMixture
 
 if TYPE_CHECKING:
     from fusion.likelihood import LikelihoodVolume
@@ -24,60 +24,6 @@ if TYPE_CHECKING:
 _RANGE_NATS = 12.0  # cells this far below the peak hold no mass worth counting
 _WINDOW_SIGMAS = 3.0
 _WINDOW_ROUNDS = 6
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GaussianMixture:
-    """Weighted Gaussians over poses.
-
-    Parameters
-    ----------
-    weights : (M,) float64
-        Probability mass of each component, positive. The sum is at most 1: what is missing lies outside every
-        component (clutter).
-    means : (M, 3) float64
-        ``[x, y, yaw]``, map frame.
-    covariances : (M, 3, 3) float64
-        On the axes of the map, positive definite.
-
-    Raises
-    ------
-    SkyfixError
-        When there is no component, shapes disagree, or a weight or covariance is not positive.
-    """
-
-    weights: FloatArray
-    means: FloatArray
-    covariances: FloatArray
-
-    def __post_init__(self) -> None:
-        weights = checked("mixture weights", self.weights, ("M",))
-        if len(weights) == 0 or weights.min() <= 0.0 or weights.sum() > 1.0 + 1e-6:
-            raise SkyfixError(f"mixture weights: expected positive with a sum <= 1, got {weights}")
-        means = checked("mixture means", self.means, (len(weights), 3)).copy()
-        means[:, 2] = se2.wrap(means[:, 2])
-        covariances = checked("mixture covariances", self.covariances, (len(weights), 3, 3))
-        if np.linalg.eigvalsh(covariances).min() <= 0.0:
-            raise SkyfixError("mixture covariances: expected positive definite, got an eigenvalue <= 0")
-        object.__setattr__(self, "weights", read_only(weights))
-        object.__setattr__(self, "means", read_only(means))
-        object.__setattr__(self, "covariances", read_only(covariances))
-
-    def __len__(self) -> int:
-        return len(self.weights)
-
-    def component_log_density(self, poses: ArrayLike) -> FloatArray:
-        """ln of weight times density of each component, (N, M), at poses (N, 3); yaw residuals are wrapped."""
-        residual = checked("poses", poses, ("N", 3))[:, None, :] - self.means
-        residual[..., 2] = se2.wrap(residual[..., 2])
-        root = np.linalg.cholesky(self.covariances)
-        white = np.einsum("mij,nmj->nmi", np.linalg.inv(root), residual)
-        log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        return np.log(self.weights) - 0.5 * ((white**2).sum(axis=-1) + log_det + 3.0 * np.log(se2.TWO_PI))
-
-    def log_density(self, poses: ArrayLike) -> FloatArray:
-        """ln density (N,) of the sum of the components at poses (N, 3)."""
-        return np.asarray(logsumexp(self.component_log_density(poses), axis=1))
 
 
 def circular_run(mask: BoolArray) -> IntArray:
@@ -90,56 +36,103 @@ def circular_run(mask: BoolArray) -> IntArray:
     return (start + np.arange(size - int(gaps[last]) + 1)) % size
 
 
-def _cells_worth_counting(volume: "LikelihoodVolume", threshold: float) -> tuple[Float32Array, IntArray, IntArray]:
-    """The box of cells above the threshold: log densities (r, c, b), its corner (row, col), its yaw bins (b,)."""
-    bins = circular_run(volume.bin_peaks > threshold)
-    values = volume.log_prob if len(bins) == volume.log_prob.shape[2] else volume.log_prob[:, :, bins]
-    if len(bins) == volume.log_prob.shape[2]:
-        bins = np.arange(len(bins))
-    plan = values.max(axis=2) > threshold
-    rows, cols = np.flatnonzero(plan.any(axis=1)), np.flatnonzero(plan.any(axis=0))
-    box = values[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-    return box, np.array([rows[0], cols[0]]), bins
+@dataclass(frozen=True, slots=True)
+class _Box:
+    """The part of a volume that holds its mass: log densities, and where they lie in the volume."""
+
+    log_prob: Float32Array  # (rows, cols, bins)
+    row: int
+    col: int
+    bins: IntArray
+    is_full_circle: bool
+
+    @classmethod
+    def above(cls, volume: "LikelihoodVolume", threshold: float) -> "_Box":
+        bin_count = volume.log_prob.shape[2]
+        bins = circular_run(volume.bin_peaks > threshold)
+        is_full_circle = len(bins) == bin_count
+        bins = np.arange(bin_count) if is_full_circle else bins
+        values = volume.log_prob if is_full_circle else volume.log_prob[:, :, bins]
+        plan = values.max(axis=2) > threshold
+        rows, cols = np.flatnonzero(plan.any(axis=1)), np.flatnonzero(plan.any(axis=0))
+        box = values[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+        return cls(box, int(rows[0]), int(cols[0]), bins, is_full_circle)
+
+    def maxima(self, threshold: float) -> IntArray:
+        """Cells (N, 3) above the threshold that no neighbour exceeds, highest first."""
+        edges = ("constant", "constant", "wrap" if self.is_full_circle else "constant")
+        highest = ndimage.maximum_filter(self.log_prob, size=3, mode=edges, cval=-np.inf)
+        cells = np.argwhere((self.log_prob == highest) & (self.log_prob > threshold))
+        return cells[np.argsort(-self.log_prob[tuple(cells.T)], kind="stable")]
 
 
-def _separate(candidates: FloatArray, k: int, radii: FloatArray) -> FloatArray:
-    """Greedy non-maximum suppression: the first `k` of the candidates (N, 3), best first, apart by `radii` (3,)."""
-    kept: list[FloatArray] = []
-    while len(candidates) and len(kept) < k:
-        best = candidates[0]
-        kept.append(best)
-        candidates = candidates[_squared_distance(candidates, best[None], radii)[:, 0] > 1.0]
+def _offsets(cells: IntArray, origin: IntArray, bin_count: int) -> IntArray:
+    """Cell indices (..., 3) counted from `origin`, the third the short way round the circle."""
+    offset = cells - origin
+    offset[..., 2] = (offset[..., 2] + bin_count // 2) % bin_count - bin_count // 2
+    return offset
+
+
+def _separate(cells: IntArray, k: int, reach: FloatArray, bin_count: int) -> IntArray:
+    """Greedy non-maximum suppression: the first `k` of the cells, best first, more than `reach` (3,) cells apart."""
+    kept: list[IntArray] = []
+    while len(cells) and len(kept) < k:
+        kept.append(cells[0])
+        offset = (_offsets(cells, cells[0], bin_count) / reach) ** 2
+        cells = cells[(offset[:, 0] + offset[:, 1] > 1.0) | (offset[:, 2] > 1.0)]
     return np.array(kept)
 
 
-def _squared_distance(poses: FloatArray, peaks: FloatArray, radii: FloatArray) -> FloatArray:
-    """Squared distances (N, M), in units of the separation radii, position or heading, whichever is larger."""
-    position = ((poses[:, None, :2] - peaks[:, :2]) ** 2).sum(axis=-1) / radii[0] ** 2
-    heading = (se2.wrap(poses[:, None, 2] - peaks[:, 2]) / radii[2]) ** 2
-    return np.maximum(position, heading)
+def _nearest_peak(shape: tuple[int, ...], peaks: IntArray, reach: FloatArray, bin_count: int) -> NDArray[np.int32]:
+    """Index of the nearest peak for every cell of a box; position or heading, whichever is farther, counts."""
+    nearest = np.zeros(shape, dtype=np.int32)
+    least = np.full(shape, np.inf, dtype=np.float32)
+    row, col, yaw = (np.arange(size) for size in shape)
+    for index, peak in enumerate(peaks):
+        around = (yaw - peak[2] + bin_count // 2) % bin_count - bin_count // 2
+        position = ((row - peak[0]) / reach[0])[:, None] ** 2 + ((col - peak[1]) / reach[1]) ** 2
+        heading = (around / reach[2]) ** 2
+        distance = np.maximum(position.astype(np.float32)[:, :, None], heading.astype(np.float32))
+        closer = distance < least
+        nearest[closer] = index
+        np.minimum(least, distance, out=least)
+    return nearest
 
 
 def _moments(
-    poses: FloatArray, mass: FloatArray, peak: FloatArray, radii: FloatArray, cell: FloatArray
+    mass: Float32Array, peak: IntArray, reach: FloatArray, wraps: bool
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Weight, mean and covariance of the mass within three standard deviations of the mean, starting at `radii`."""
-    residual = poses - peak
-    residual[:, 2] = se2.wrap(residual[:, 2])
-    centre, half = np.zeros(3), radii.copy()
+    """Weight, mean offset from the peak and covariance, in cells, of the mass (rows, cols, bins) around a peak.
+
+    The window starts at `reach` and grows to three standard deviations. Three sums over single axes give every
+    moment: each pair of coordinates is seen in one of the three planes.
+    """
+    centre, half = np.zeros(3), reach.copy()
     for _ in range(_WINDOW_ROUNDS):
-        inside = (np.abs(residual - centre) <= half).all(axis=1)
-        here, share = residual[inside], mass[inside]
-        weight = float(share.sum())
-        centre = share @ here / weight
-        deviation = here - centre
-        covariance = (deviation * share[:, None]).T @ deviation / weight + np.diag(cell**2 / 12.0)
-        grown = np.maximum(radii, _WINDOW_SIGMAS * np.sqrt(np.diag(covariance)))
+        first = np.ceil(centre - half).astype(np.int64)
+        last = np.floor(centre + half).astype(np.int64)
+        if wraps:
+            last[2] = min(last[2], first[2] + mass.shape[2] - 1)
+            first[:2] = np.maximum(first[:2], -peak[:2])
+            last[:2] = np.minimum(last[:2], np.array(mass.shape[:2]) - 1 - peak[:2])
+        else:
+            first, last = np.maximum(first, -peak), np.minimum(last, np.array(mass.shape) - 1 - peak)
+        row, col, yaw = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
+        window = mass[peak[0] + row[0] : peak[0] + row[-1] + 1, peak[1] + col[0] : peak[1] + col[-1] + 1]
+        window = window[:, :, (peak[2] + yaw) % mass.shape[2]]
+        row_col, row_yaw, col_yaw = (window.sum(axis=axis).astype(np.float64) for axis in (2, 1, 0))
+        weight = row_col.sum()
+        by_row, by_col, by_yaw = row_col.sum(axis=1), row_col.sum(axis=0), row_yaw.sum(axis=0)
+        centre = np.array([by_row @ row, by_col @ col, by_yaw @ yaw]) / weight
+        row, col, yaw = row - centre[0], col - centre[1], yaw - centre[2]
+        rc, rt, ct = row @ row_col @ col, row @ row_yaw @ yaw, col @ col_yaw @ yaw
+        raw = [[by_row @ row**2, rc, rt], [rc, by_col @ col**2, ct], [rt, ct, by_yaw @ yaw**2]]
+        covariance = np.array(raw) / weight + np.eye(3) / 12.0
+        grown = np.maximum(reach, _WINDOW_SIGMAS * np.sqrt(np.diag(covariance)))
         if (grown <= 1.02 * half).all():
             break
         half = grown
-    mean = peak + centre
-    mean[2] = se2.wrap(mean[2])
-    return weight, mean, covariance
+    return float(weight), centre, covariance
 
 
 def find_modes(
@@ -164,34 +157,28 @@ def find_modes(
     Raises
     ------
     SkyfixError
-        When `k` is not positive.
+        When `k` or a separation is not positive.
     """
-    if k < 1:
-        raise SkyfixError(f"modes: expected k >= 1, got {k}")
+    if k < 1 or not (separation_m > 0.0 and separation_rad > 0.0):
+        raise SkyfixError(f"modes: expected k, separations > 0, got {k}, {separation_m} m, {separation_rad} rad")
     grid, bin_count = volume.grid, volume.log_prob.shape[2]
     cell = np.array([grid.metres_per_pixel, grid.metres_per_pixel, se2.TWO_PI / bin_count])
-    radii = np.maximum([separation_m, separation_m, separation_rad], cell)
+    reach = np.maximum(np.array([separation_m, separation_m, separation_rad]) / cell, 1.0)
     threshold = max(float(volume.bin_peaks.max()) - _RANGE_NATS, volume.floor)
-    values, corner, bins = _cells_worth_counting(volume, threshold)
+    box = _Box.above(volume, threshold)
+    peaks = _separate(box.maxima(threshold), k, reach, bin_count)
+    mass = np.exp(box.log_prob) * np.float32(volume.cell_volume)
+    nearest = _nearest_peak(mass.shape, peaks, reach, bin_count)
 
-    def poses_at(indices: tuple[IntArray, ...]) -> FloatArray:
-        row_col = np.stack(indices[:2], axis=-1) + corner + 0.5
-        return np.column_stack([grid.xy_from_pixel(row_col), se2.wrap(bins[indices[2]] * cell[2])])
-
-    edges = ("constant", "constant", "wrap" if len(bins) == bin_count else "constant")
-    highest = ndimage.maximum_filter(values, size=3, mode=edges, cval=-np.inf)
-    maxima = np.nonzero((values == highest) & (values > threshold))
-    order = np.argsort(-values[maxima], kind="stable")
-    peaks = _separate(poses_at(maxima)[order], k, radii)
-
-    cells = np.nonzero(values > threshold)
-    poses = poses_at(cells)
-    mass = np.exp(values[cells].astype(np.float64)) * cell.prod()
-    nearest = np.argmin(_squared_distance(poses, peaks, radii), axis=1)
-    parts = [_moments(poses[nearest == i], mass[nearest == i], peak, radii, cell) for i, peak in enumerate(peaks)]
-    weights = np.array([part[0] for part in parts])
-    ranked = np.argsort(-weights, kind="stable")
-    weights = weights / max(1.0, weights.sum())  # the sum may exceed 1 by rounding
-    return GaussianMixture(
-        weights[ranked], np.array([part[1] for part in parts])[ranked], np.array([part[2] for part in parts])[ranked]
-    )
+    cell_axes = np.array([[0.0, cell[0], 0.0], [-cell[1], 0.0, 0.0], [0.0, 0.0, cell[2]]])  # [x, y, yaw] per cell
+    weights, means, covariances = [], [], []
+    for index, peak in enumerate(peaks):
+        weight, offset, covariance = _moments(np.where(nearest == index, mass, 0), peak, reach, box.is_full_circle)
+        row_col = np.array([box.row, box.col]) + peak[:2] + 0.5
+        at_peak = np.append(grid.xy_from_pixel(row_col), box.bins[peak[2]] * cell[2])
+        weights.append(weight)
+        means.append(at_peak + cell_axes @ offset)
+        covariances.append(cell_axes @ covariance @ cell_axes.T)
+    ranked = np.argsort(weights)[::-1]
+    share = np.array(weights) / max(1.0, sum(weights))  # the sum may exceed 1 by rounding
+    return GaussianMixture(share[ranked], np.array(means)[ranked], np.array(covariances)[ranked])

@@ -1,0 +1,65 @@
+"""GaussianMixture: a few weighted Gaussians over poses, the form in which modes travel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import logsumexp
+
+from fusion import se2
+from fusion.arrays import FloatArray, checked, read_only
+from fusion.errors import SkyfixError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GaussianMixture:
+    """Weighted Gaussians over poses.
+
+    Parameters
+    ----------
+    weights : (M,) float64
+        Probability mass of each component, positive. The sum is at most 1: what is missing lies outside every
+        component (clutter).
+    means : (M, 3) float64
+        ``[x, y, yaw]``, map frame.
+    covariances : (M, 3, 3) float64
+        On the axes of the map, positive definite.
+
+    Raises
+    ------
+    SkyfixError
+        When there is no component, shapes disagree, or a weight or covariance is not positive.
+    """
+
+    weights: FloatArray
+    means: FloatArray
+    covariances: FloatArray
+
+    def __post_init__(self) -> None:
+        weights = checked("mixture weights", self.weights, ("M",))
+        if len(weights) == 0 or weights.min() <= 0.0 or weights.sum() > 1.0 + 1e-6:
+            raise SkyfixError(f"mixture weights: expected positive with a sum <= 1, got {weights}")
+        means = checked("mixture means", self.means, (len(weights), 3)).copy()
+        means[:, 2] = se2.wrap(means[:, 2])
+        covariances = checked("mixture covariances", self.covariances, (len(weights), 3, 3))
+        if np.linalg.eigvalsh(covariances).min() <= 0.0:
+            raise SkyfixError("mixture covariances: expected positive definite, got an eigenvalue <= 0")
+        object.__setattr__(self, "weights", read_only(weights))
+        object.__setattr__(self, "means", read_only(means))
+        object.__setattr__(self, "covariances", read_only(covariances))
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def component_log_density(self, poses: ArrayLike) -> FloatArray:
+        """ln of weight times density of each component, (N, M), at poses (N, 3); yaw residuals are wrapped."""
+        residual = checked("poses", poses, ("N", 3))[:, None, :] - self.means
+        residual[..., 2] = se2.wrap(residual[..., 2])
+        root = np.linalg.cholesky(self.covariances)
+        white = np.einsum("mij,nmj->nmi", np.linalg.inv(root), residual)
+        log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        return np.log(self.weights) - 0.5 * ((white**2).sum(axis=-1) + log_det + 3.0 * np.log(se2.TWO_PI))
+
+    def log_density(self, poses: ArrayLike) -> FloatArray:
+        """ln density (N,) of the sum of the components at poses (N, 3)."""
+        return np.asarray(logsumexp(self.component_log_density(poses), axis=1))
