@@ -10,6 +10,7 @@ from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
+from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 
@@ -19,10 +20,14 @@ __all__ = [
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
+    "OdometryIncrement",
+    "OdometryNoise",
     "OutlierMixture",
     "PoseLikelihood",
     "SkyfixError",
     "Trajectory",
     "UniformPrior",
+    "accumulate",
     "find_modes",
+    "increments_at",
 ]

@@ -163,7 +163,7 @@ class LikelihoodVolume:
         """Draw cells by their mass, then a pose uniformly inside each; (n, 3)."""
         bin_count = self.log_prob.shape[2]
         bins = circular_run(self.bin_peaks > self.floor)
-        log_prob = self.log_prob if len(bins) == bin_count else self.log_prob[:, :, bins]
+        log_prob = self.log_prob if len(bins) == bin_count else self.log_prob.take(bins, axis=2)
         cumulative = np.cumsum(np.exp(log_prob - self.bin_peaks.max(), dtype=np.float64))
         drawn = np.searchsorted(cumulative, rng.random(n) * cumulative[-1], side="right")
         row, col, run = np.unravel_index(np.minimum(drawn, log_prob.size - 1), log_prob.shape)
@@ -182,7 +182,7 @@ class LikelihoodVolume:
         if checked_temperature(temperature) == 1.0:
             return self
         bins = circular_run(self.bin_peaks > self.floor)
-        part = self.log_prob if len(bins) == self.log_prob.shape[2] else self.log_prob[:, :, bins]
+        part = self.log_prob if len(bins) == self.log_prob.shape[2] else self.log_prob.take(bins, axis=2)
         evaluated = part > self.floor
         scaled = (part - np.float32(self.bin_peaks.max())) / np.float32(temperature)
         mass = np.exp(scaled).sum(where=evaluated, dtype=np.float64)

@@ -7,11 +7,10 @@ spread inside a cell (width^2 / 12) included, which keeps every covariance posit
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from fusion import se2
 from fusion.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -52,7 +51,7 @@ class _Box:
         bins = circular_run(volume.bin_peaks > threshold)
         is_full_circle = len(bins) == bin_count
         bins = np.arange(bin_count) if is_full_circle else bins
-        values = volume.log_prob if is_full_circle else volume.log_prob[:, :, bins]
+        values = volume.log_prob if is_full_circle else volume.log_prob.take(bins, axis=2)
         plan = values.max(axis=2) > threshold
         rows, cols = np.flatnonzero(plan.any(axis=1)), np.flatnonzero(plan.any(axis=0))
         box = values[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
@@ -60,8 +59,12 @@ class _Box:
 
     def maxima(self, threshold: float) -> IntArray:
         """Cells (N, 3) above the threshold that no neighbour exceeds, highest first."""
-        edges = ("constant", "constant", "wrap" if self.is_full_circle else "constant")
-        highest = ndimage.maximum_filter(self.log_prob, size=3, mode=edges, cval=-np.inf)
+        highest = self.log_prob
+        for axis in range(3):
+            edge: Literal["wrap", "edge"] = "wrap" if axis == 2 and self.is_full_circle else "edge"
+            padded = np.pad(highest, [(int(axis == i), int(axis == i)) for i in range(3)], mode=edge)
+            low, mid, high = (np.moveaxis(padded, axis, 0)[i : i + highest.shape[axis]] for i in range(3))
+            highest = np.moveaxis(np.maximum(np.maximum(low, mid), high), 0, axis)
         cells = np.argwhere((self.log_prob == highest) & (self.log_prob > threshold))
         return cells[np.argsort(-self.log_prob[tuple(cells.T)], kind="stable")]
 

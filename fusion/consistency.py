@@ -1,0 +1,87 @@
+"""Is the stated uncertainty the real one? NEES and coverage, and the temperature for errors correlated in time.
+
+Source of NEES: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, 5.4.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
+
+from fusion.arrays import FloatArray, checked
+from fusion.errors import SkyfixError
+
+MAX_TEMPERATURE = 1e3
+
+
+def correlated_error_temperature(distance_m: float, correlation_length_m: float) -> float:
+    """By how much to flatten a likelihood whose error the previous measurement shared.
+
+    The network sees nearly the same scene `distance_m` later and repeats its error. If errors are a first-order
+    autoregression with ``rho = exp(-distance / length)``, then n measurements are worth ``n (1 - rho) / (1 + rho)``
+    independent ones, so each likelihood is to be raised to the power 1 / T with ``T = (1 + rho) / (1 - rho)``.
+    The first measurement of a drive has no predecessor and counts in full.
+
+    Parameters
+    ----------
+    distance_m : float
+        Distance driven since the previous measurement, >= 0.
+    correlation_length_m : float
+        Distance over which the correlation falls to 1/e; 0 for independent errors.
+
+    Returns
+    -------
+    float
+        T in [1, 1000]; at no distance the limit, infinity, is cut to 1000.
+
+    Raises
+    ------
+    SkyfixError
+        When an argument is negative or not finite.
+    """
+    for name, value in (("distance_m", distance_m), ("correlation_length_m", correlation_length_m)):
+        if not (np.isfinite(value) and value >= 0.0):
+            raise SkyfixError(f"{name}: expected >= 0, got {value}")
+    if correlation_length_m == 0.0:
+        return 1.0
+    half = 0.5 * distance_m / correlation_length_m
+    return float(1.0 / max(np.tanh(half), 1.0 / MAX_TEMPERATURE))  # (1 + rho) / (1 - rho) = coth(d / 2L)
+
+
+def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:
+    """Normalised estimation error squared, ``e^T P^-1 e`` (N,); its mean is D when the covariances are right.
+
+    Parameters
+    ----------
+    errors : (N, D) array_like
+        Estimate minus truth, angles wrapped, in the frame of the covariances.
+    covariances : (N, D, D) array_like
+        Positive definite.
+
+    Raises
+    ------
+    SkyfixError
+        When shapes disagree or a covariance is not positive definite.
+    """
+    errors = checked("errors", errors, ("N", "D"))
+    count, dof = errors.shape
+    covariances = checked("covariances", covariances, (count, dof, dof))
+    try:
+        root = np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError as error:
+        raise SkyfixError("covariances: expected positive definite, got one that is not") from error
+    white = np.linalg.solve(root, errors[..., None])[..., 0]
+    return (white**2).sum(axis=1)
+
+
+def coverage(nees_values: ArrayLike, dof: int, level: float = 0.95) -> float:
+    """Fraction of NEES values inside the `level` ellipsoid of `dof` dimensions; `level` when all is right.
+
+    Raises
+    ------
+    SkyfixError
+        When there are no values, or `level` is not in (0, 1).
+    """
+    values = checked("nees", nees_values, ("N",))
+    if len(values) == 0 or not 0.0 < level < 1.0:
+        raise SkyfixError(f"coverage: expected values and a level in (0, 1), got {len(values)} values, level {level}")
+    return float((values <= chi2.ppf(level, dof)).mean())
