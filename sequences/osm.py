@@ -1,8 +1,9 @@
 """OpenStreetMap extracts (.osm.pbf, .osm.gz, .osm) as plain features in local metres, and their rasters.
 
-Projection: transverse Mercator on WGS 84 with its natural origin at the extract's median node (or a given origin) and scale 1, so
-that distances are true to 1e-7 over a town. Rasters look like those that map-localization datasets use: areas first (the large below
-the small, buildings last), then every way as a line of one pixel: roads as centrelines, walls, fences and hedges; points not at all.
+Projection: transverse Mercator on WGS 84 with its natural origin at the extract's median node (or a given origin)
+and scale 1, so that distances are true to 1e-7 over a town. Rasters look like those that map-localization datasets
+use: areas first (the large below the small, buildings last), then every way as a line of one pixel: roads as
+centrelines, walls, fences and hedges; points not at all.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ _POINT_KINDS = {("natural", "tree"): "tree", ("highway", "street_lamp"): "pole",
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """A polygon: `rings[0]` its outer ring (N, 2), the rest holes; map frame, metres. Height NaN where it is not known."""
+    """A polygon: `rings[0]` its outer ring (N, 2), the rest holes; map frame, metres. Height NaN where it is not
+    known."""
 
     kind: str
     rings: tuple[NDArray[np.float64], ...]

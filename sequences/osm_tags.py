@@ -1,7 +1,7 @@
 """What OpenStreetMap tags mean in the map vocabulary: class, width and height of a tagged thing.
 
-The tables follow the OpenStreetMap wiki (keys building, highway, barrier, landuse, natural, leisure, amenity, waterway). The classes
-are those of `learned.map_raster.CLASSES`.
+The tables follow the OpenStreetMap wiki (keys building, highway, barrier, landuse, natural, leisure, amenity,
+waterway). The classes are those of `learned.map_raster.CLASSES`.
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ def metres(text: str | None) -> float:
 
 
 def is_underground(tags: Tags) -> bool:
-    """Whether a thing is in a tunnel, below ground or indoors, so that neither a scan nor an aerial image shows it."""
+    """Whether a thing is in a tunnel, below ground or indoors, so that neither a scan nor an aerial image shows
+    it."""
     layer = re.match(r"^\s*-\d", tags.get("layer", ""))
     return (
         layer is not None

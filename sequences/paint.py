@@ -1,7 +1,8 @@
-"""Painting of metric shapes into rasters with sub-pixel accuracy: the only place where map metres meet OpenCV's pixels.
+"""Painting of metric shapes into rasters with sub-pixel accuracy: the only place where map metres meet OpenCV's
+pixels.
 
-OpenCV puts pixel centres at integers, the project at +0.5 (`fusion.grid`); the shift is taken out here. Coordinates are passed in
-fixed point with `SHIFT` fractional bits.
+OpenCV puts pixel centres at integers, the project at +0.5 (`fusion.grid`); the shift is taken out here. Coordinates
+are passed in fixed point with `SHIFT` fractional bits.
 """
 
 from __future__ import annotations

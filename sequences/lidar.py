@@ -1,0 +1,295 @@
+"""Scans of a spinning LiDAR in a 2.5-D world.
+
+For every azimuth the kernel walks outward from cell to cell (Amanatides and Woo, "A fast voxel traversal
+algorithm", 1987). Solids are a height field, so of the beams sorted by elevation the lowest unresolved one is
+always the first to be hit: one pointer serves all beams and an azimuth costs O(cells + beams). Porous slabs return
+a beam with a chance per metre of path; the random numbers are hashes of (seed, azimuth, beam, cell), so a scan does
+not depend on threads or on the order of work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.errors import SkyfixError
+from sequences.world_model import DENSITY_STEP_PER_M, HEIGHT_STEP_M, World
+
+_BUILDING, _FOLIAGE = 2, 5
+_WHEEL_BASE_M, _TRACK_M = 2.7, 1.6
+_REFLECTANCE = np.array([0.25, 0.2, 0.4, 0.35, 0.3, 0.35, 0.35, 0.5, 0.3, 0.05], dtype=np.float32)
+_DROP_OUT = np.array([0.0, 0.02, 0.06, 0.02, 0.03, 0.02, 0.12, 0.03, 0.02, 0.8], dtype=np.float32)
+
+
+def hdl64_elevations_deg() -> NDArray[np.float64]:
+    """Elevations (64,) of an HDL-64E: 32 beams from +2 by 1/3 degree, 32 from -8.83 to -24.8 by about 1/2 degree."""
+    return np.concatenate([2.0 - np.arange(32) * (10.33 / 31.0), -8.83 - np.arange(32) * (15.97 / 31.0)])
+
+
+def hdl32_elevations_deg() -> NDArray[np.float64]:
+    """Elevations (32,) of an HDL-32E: +10.67 to -30.67 by 4/3 degree."""
+    return 10.67 - np.arange(32) * (41.34 / 31.0)
+
+
+@dataclass(frozen=True, slots=True)
+class LidarModel:
+    """A spinning LiDAR on a car.
+
+    Attributes
+    ----------
+    elevations_deg
+        Beam elevations above the sensor's horizon, degrees.
+    azimuths
+        Beams of one elevation per revolution.
+    min_range_m, max_range_m
+        Horizontal distances outside which nothing is returned.
+    range_noise_m, beam_bias_m
+        Standard deviations of the noise of each return and of each beam's constant error.
+    drop_out
+        Share of returns lost at random, beside what each material swallows.
+    glass_share
+        Share of facade patches (about 1 x 1 m) that are glass and return nothing.
+    mount_height_m
+        Sensor above the ground.
+    tilt_noise_deg
+        Standard deviation of roll and pitch beside what the terrain makes of them.
+    """
+
+    elevations_deg: tuple[float, ...] = tuple(hdl64_elevations_deg())
+    azimuths: int = 1000
+    min_range_m: float = 2.0
+    max_range_m: float = 85.0
+    range_noise_m: float = 0.02
+    beam_bias_m: float = 0.015
+    drop_out: float = 0.03
+    glass_share: float = 0.12
+    mount_height_m: float = 1.73
+    tilt_noise_deg: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not self.elevations_deg or max(abs(e) for e in self.elevations_deg) >= 80.0:
+            raise SkyfixError("lidar: expected beam elevations within +-80 degrees, got none or steeper ones")
+        if self.azimuths < 4 or not 0.0 < self.min_range_m < self.max_range_m:
+            raise SkyfixError(
+                "lidar: expected at least 4 azimuths and 0 < min_range_m < max_range_m, "
+                f"got {self.azimuths}, {self.min_range_m}, {self.max_range_m}"
+            )
+
+    @classmethod
+    def random(cls, rng: np.random.Generator, azimuths: int = 1000) -> LidarModel:
+        """Draw a sensor: mostly HDL-64 with small errors, sometimes 32 beams or an even fan, at varying heights."""
+        kind = rng.random()
+        if kind < 0.7:
+            elevations = hdl64_elevations_deg()
+        elif kind < 0.85:
+            elevations = hdl32_elevations_deg()
+        else:
+            elevations = np.linspace(rng.uniform(2.0, 15.0), rng.uniform(-25.0, -15.0), int(rng.integers(32, 129)))
+        return cls(
+            tuple(float(e) for e in elevations + rng.normal(0.0, 0.03, len(elevations))),
+            azimuths,
+            min_range_m=float(rng.uniform(1.8, 3.0)),
+            max_range_m=float(rng.uniform(70.0, 100.0)),
+            range_noise_m=float(rng.uniform(0.01, 0.04)),
+            beam_bias_m=float(rng.uniform(0.0, 0.03)),
+            drop_out=float(rng.uniform(0.0, 0.12)),
+            glass_share=float(rng.uniform(0.0, 0.3)),
+            mount_height_m=float(rng.normal(1.75, 0.06)) if kind < 0.7 else float(rng.uniform(1.6, 2.1)),
+            tilt_noise_deg=float(rng.uniform(0.1, 0.8)),
+        )
+
+
+def simulate_scan(
+    world: World, pose: NDArray[np.float64], model: LidarModel, rng: np.random.Generator | int
+) -> NDArray[np.float32]:
+    """Cast one revolution of beams.
+
+    Parameters
+    ----------
+    world
+        What there is to hit; beams that leave it return nothing.
+    pose
+        Vehicle pose (3,), map frame.
+    model
+        The sensor.
+    rng
+        Generator or seed of noise, drop-out and foliage; same state, same scan.
+
+    Returns
+    -------
+    points
+        (N, 4) float32: x forward, y left, z up of the sensor, metres, and reflectance in [0, 1]. The ground under
+        the vehicle is at z = -mount height; the frame pitches and rolls with the vehicle.
+
+    Raises
+    ------
+    SkyfixError
+        If the pose is not finite or outside the world.
+    """
+    pose = np.asarray(pose, dtype=np.float64)
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise SkyfixError(f"lidar: expected a finite pose (3,), got {pose.tolist()}")
+    if not bool(world.grid.contains(pose[:2])):
+        raise SkyfixError(f"lidar: expected a pose inside the world, got ({pose[0]:.1f}, {pose[1]:.1f})")
+    rng = np.random.default_rng(rng)
+    height, pitch, roll = _attitude(world, pose)
+    pitch, roll = np.array([pitch, roll]) + np.deg2rad(model.tilt_noise_deg) * rng.standard_normal(2)
+    elevations = np.sort(np.deg2rad(np.array(model.elevations_deg)))
+    bias = model.beam_bias_m * rng.standard_normal(len(elevations))
+    azimuths = (np.arange(model.azimuths) + rng.random()) * (2.0 * np.pi / model.azimuths)
+    start = world.grid.pixel_from_xy(pose[:2])
+    distance, kind = _cast(
+        world.surface,
+        world.ground,
+        world.canopy_bottom,
+        world.canopy_top,
+        world.canopy_density,
+        world.material,
+        start[0],
+        start[1],
+        world.grid.metres_per_pixel,
+        height + model.mount_height_m,
+        pose[2] + azimuths,
+        np.tan(elevations),
+        np.tan(pitch) * np.cos(azimuths) + np.tan(roll) * np.sin(azimuths),
+        model.min_range_m,
+        model.max_range_m,
+        model.glass_share,
+        np.uint32(rng.integers(0, 2**32, dtype=np.uint64)),
+    )
+    hit_azimuth, hit_beam = np.nonzero(distance > 0.0)
+    hit_kind = kind[hit_azimuth, hit_beam]
+    kept = rng.random(len(hit_kind)) >= 1.0 - (1.0 - model.drop_out) * (1.0 - _DROP_OUT[hit_kind])
+    hit_azimuth, hit_beam, hit_kind = hit_azimuth[kept], hit_beam[kept], hit_kind[kept]
+    along = distance[hit_azimuth, hit_beam]
+    noise = bias[hit_beam] + model.range_noise_m * rng.standard_normal(len(along))
+    tilt = np.tan(pitch) * np.cos(azimuths) + np.tan(roll) * np.sin(azimuths)
+    in_world = np.arctan(np.tan(elevations)[hit_beam] + tilt[hit_azimuth])
+    reach = along / np.cos(in_world) + noise
+    flat = reach * np.cos(elevations)[hit_beam]
+    reflectance = np.clip(_REFLECTANCE[hit_kind] + 0.1 * rng.standard_normal(len(along)), 0.0, 1.0)
+    points = np.empty((len(along), 4), dtype=np.float32)
+    points[:, 0] = flat * np.cos(azimuths)[hit_azimuth]
+    points[:, 1] = flat * np.sin(azimuths)[hit_azimuth]
+    points[:, 2] = reach * np.sin(elevations)[hit_beam]
+    points[:, 3] = reflectance
+    return points
+
+
+def _attitude(world: World, pose: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Height of the ground under the vehicle, pitch (nose up) and roll (left side up) that the terrain gives it."""
+    forward = 0.5 * _WHEEL_BASE_M * np.array([np.cos(pose[2]), np.sin(pose[2])])
+    left = 0.5 * _TRACK_M * np.array([-np.sin(pose[2]), np.cos(pose[2])])
+    wheels = pose[:2] + np.array([forward + left, forward - left, -forward + left, -forward - left])
+    front_left, front_right, rear_left, rear_right = world.ground_at(wheels)
+    pitch = np.arctan(0.5 * (front_left + front_right - rear_left - rear_right) / _WHEEL_BASE_M)
+    roll = np.arctan(0.5 * (front_left + rear_left - front_right - rear_right) / _TRACK_M)
+    return 0.25 * (front_left + front_right + rear_left + rear_right), float(pitch), float(roll)
+
+
+@numba.njit(cache=True, inline="always")
+def _uniform(seed: np.uint32, a: int, b: int, c: int) -> float:
+    """Hash three counters to a number in [0, 1) (finaliser of MurmurHash3)."""
+    h = np.uint32(seed ^ np.uint32(a) * np.uint32(0x9E3779B1))
+    h = np.uint32(h ^ np.uint32(b) * np.uint32(0x85EBCA77))
+    h = np.uint32(h ^ np.uint32(c) * np.uint32(0xC2B2AE3D))
+    h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(0x85EBCA6B))
+    h = np.uint32((h ^ (h >> np.uint32(13))) * np.uint32(0xC2B2AE35))
+    h = np.uint32(h ^ (h >> np.uint32(16)))
+    return float(h) * 2.3283064365386963e-10
+
+
+@numba.njit(cache=True, fastmath=True)
+def _cast(
+    surface: NDArray[np.float32],
+    ground: NDArray[np.float32],
+    canopy_bottom: NDArray[np.uint8],
+    canopy_top: NDArray[np.uint8],
+    canopy_density: NDArray[np.uint8],
+    material: NDArray[np.uint8],
+    row0: float,
+    col0: float,
+    step_m: float,
+    sensor_z: float,
+    headings: NDArray[np.float64],
+    tangents: NDArray[np.float64],
+    tilts: NDArray[np.float64],
+    min_range: float,
+    max_range: float,
+    glass_share: float,
+    seed: np.uint32,
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Horizontal distance (azimuths, beams) of every return, 0 where there is none, and the material hit."""
+    beams = tangents.shape[0]
+    rows, cols = surface.shape
+    distance = np.zeros((headings.shape[0], beams))
+    kind = np.zeros((headings.shape[0], beams), dtype=np.uint8)
+    done = np.zeros(beams, dtype=np.bool_)
+    slope = np.empty(beams)
+    for a in range(headings.shape[0]):
+        done[:] = False
+        slope[:] = tangents + tilts[a]
+        d_col, d_row = np.cos(headings[a]), -np.sin(headings[a])
+        row, col = int(np.floor(row0)), int(np.floor(col0))
+        step_row, step_col = (1 if d_row > 0 else -1), (1 if d_col > 0 else -1)
+        big = 1e18
+        per_row = step_m / abs(d_row) if abs(d_row) > 1e-12 else big
+        per_col = step_m / abs(d_col) if abs(d_col) > 1e-12 else big
+        next_row = per_row * ((row + 1 - row0) if d_row > 0 else (row0 - row)) if per_row < big else big
+        next_col = per_col * ((col + 1 - col0) if d_col > 0 else (col0 - col)) if per_col < big else big
+        lowest = 0
+        entry = 0.0
+        while lowest < beams and entry < max_range:
+            leave = min(next_row, next_col)
+            if entry >= min_range:
+                top = surface[row, col]
+                slab_top = canopy_top[row, col]
+                if slab_top > 0:
+                    z_floor = ground[row, col]
+                    z_top = z_floor + HEIGHT_STEP_M * slab_top
+                    z_bottom = z_floor + HEIGHT_STEP_M * canopy_bottom[row, col]
+                    chance = 1.0 - np.exp(-DENSITY_STEP_PER_M * canopy_density[row, col] * (leave - entry))
+                    middle = 0.5 * (entry + leave)
+                    for b in range(lowest, beams):
+                        z = sensor_z + middle * slope[b]
+                        if z >= z_top:
+                            break
+                        if done[b] or z < z_bottom or z <= top:
+                            continue
+                        if _uniform(seed, a, b, row * cols + col) < chance:
+                            done[b] = True
+                            along = _uniform(seed + np.uint32(1), a, b, row * cols + col)
+                            distance[a, b] = entry + along * (leave - entry)
+                            kind[a, b] = _FOLIAGE
+                while lowest < beams:
+                    if done[lowest]:
+                        lowest += 1
+                        continue
+                    z_in = sensor_z + entry * slope[lowest]
+                    if z_in <= top:
+                        hit = entry
+                    elif sensor_z + leave * slope[lowest] <= top:
+                        hit = (top - sensor_z) / slope[lowest]
+                    else:
+                        break
+                    what = material[row, col]
+                    if what == _BUILDING and glass_share > 0.0:
+                        patch = _uniform(np.uint32(77), row // 5, col // 5, int(np.floor(0.8 * z_in + 1000.0)))
+                        if patch < glass_share:
+                            hit = 0.0
+                    distance[a, lowest] = hit
+                    kind[a, lowest] = what
+                    lowest += 1
+            entry = leave
+            if next_row < next_col:
+                row += step_row
+                next_row += per_row
+            else:
+                col += step_col
+                next_col += per_col
+            if row < 0 or col < 0 or row >= rows or col >= cols:
+                break
+    return distance, kind
