@@ -1,0 +1,118 @@
+"""What turns a scan and a map into a likelihood: the protocol every network and baseline follows, and how one is loaded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.errors import SkyfixError
+from fusion.grid import MapGrid
+from fusion.likelihood import LikelihoodVolume
+from learned.map_raster import MapRaster
+
+
+@dataclass(frozen=True, slots=True)
+class SearchRegion:
+    """Where to look: a square of positions about a centre and a range of headings about its yaw.
+
+    Attributes
+    ----------
+    centre
+        (3,) x, y (metres, map frame), yaw (radians).
+    half_extent_m
+        Half the side of the square of positions, metres.
+    half_heading_rad
+        Headings within this of the centre's; pi means any.
+    """
+
+    centre: NDArray[np.float64]
+    half_extent_m: float
+    half_heading_rad: float = math.pi
+
+    def __post_init__(self) -> None:
+        if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
+            raise SkyfixError(f"search centre: expected three finite numbers (x, y, yaw), got {self.centre}")
+        if not (self.half_extent_m > 0 and self.half_heading_rad > 0):
+            raise SkyfixError(
+                f"search region: expected positive ranges, got {self.half_extent_m} m and {self.half_heading_rad} rad"
+            )
+
+
+class MapMatcher(Protocol):
+    """A measurement model: one scan against one map, over a region of poses."""
+
+    @property
+    def name(self) -> str:
+        """Short name for tables."""
+        ...
+
+    @property
+    def error_correlation_length_m(self) -> float:
+        """Distance travelled over which errors of neighbouring frames decorrelate (1/e), metres."""
+        ...
+
+    def match(
+        self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
+    ) -> LikelihoodVolume:
+        """Likelihood of the poses in the search region given one scan.
+
+        Parameters
+        ----------
+        points
+            (N, 4) float32 x, y, z, reflectance in the body frame, metres.
+        ground_z
+            Height of the ground under the vehicle in the scan's frame, metres.
+        map_raster
+            The map, of any size and resolution; what is needed is cut out.
+        search
+            The poses to score; others get the floor.
+
+        Raises
+        ------
+        SkyfixError
+            If the scan is empty or not finite, or the map lacks what the matcher needs.
+        """
+        ...
+
+
+def matching_window(
+    map_raster: MapRaster, search: SearchRegion, reach_m: float, metres_per_pixel: float, multiple_of: int = 2
+) -> MapGrid:
+    """Grid of the map crop that a search needs: positions within the half extent, and the scan's reach around them.
+
+    It is snapped to the map's pixels where both have the same resolution, so that cropping copies pixels and does not resample.
+    Its side is a multiple of an even number of pixels (what a network's strides ask for).
+    """
+    size = multiple_of * math.ceil(2 * (search.half_extent_m + reach_m) / metres_per_pixel / multiple_of)
+    half_pixels = size // 2
+    grid = map_raster.grid
+    corner = np.asarray(search.centre[:2], dtype=np.float64) - half_pixels * metres_per_pixel
+    steps = np.round((corner - (grid.x0, grid.y0)) / metres_per_pixel)
+    x0, y0 = np.array([grid.x0, grid.y0]) + steps * metres_per_pixel
+    return MapGrid(size, size, metres_per_pixel, float(x0), float(y0))
+
+
+def load_matcher(name_or_path: str) -> MapMatcher:
+    """Load a matcher by name ('rotmatch': the shipped weights; 'geometric': no learning) or a checkpoint's path (.safetensors).
+
+    Raises
+    ------
+    SkyfixError
+        If the name is unknown, the file is missing, or the checkpoint does not match this version's network.
+    """
+    from learned.geometric import GeometricMatcher
+    from learned.rotmatch import RotMatch
+
+    if name_or_path == "geometric":
+        return GeometricMatcher()
+    if name_or_path == "rotmatch":
+        return RotMatch.shipped()
+    path = Path(name_or_path)
+    if path.suffix == ".safetensors":
+        return RotMatch.load(path)
+    raise SkyfixError(f"matcher: expected 'rotmatch', 'geometric' or a .safetensors file, got {name_or_path!r}")

@@ -1,0 +1,212 @@
+"""RotMatch: learned features of scan and map through rotated-template voting, the default network on a CPU.
+
+Two small U-Nets, one for the bird's-eye view of the scan and one for the picture of the map, give unit feature vectors a metre
+apart; the scan's also says how much each cell is worth. Voting turns them into a score for every pose. The principle is
+that of Barsan et al. (CoRL 2018) and of OrienterNet (Sarlin et al., CVPR 2023); sizes are chosen for two CPU cores.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from fusion.errors import SkyfixError
+from fusion.likelihood import LikelihoodVolume
+from learned.bev import BANDS_M, BevSettings, bev_counts, log_density
+from learned.map_raster import MapRaster
+from learned.matcher import SearchRegion, matching_window
+from learned.voting import bin_yaws, vote, volume_from_scores, yaw_bins_within
+
+ARCHITECTURE = "rotmatch-1"
+STRIDE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class RotMatchSettings:
+    """Sizes of the network: features a cell, widths of the U-Nets' levels (strides 2, 4, 8, 16), extent of the scan's image."""
+
+    channels: int = 8
+    widths: tuple[int, int, int, int] = (16, 32, 48, 64)
+    bev: BevSettings = field(default_factory=BevSettings)
+
+
+class _Block(nn.Sequential):
+    """Convolution, group normalisation, ReLU. Kernels of even size keep a stride of 2 centred: turning commutes with it."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
+        super().__init__(
+            nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=(kernel - stride + 1) // 2, bias=False),
+            nn.GroupNorm(4, outputs),
+            nn.ReLU(inplace=True),
+        )
+
+
+class FeatureNet(nn.Module):
+    """A small U-Net: (B, inputs, H, W) -> (B, outputs, H / 2, W / 2), receptive field about the whole image."""
+
+    def __init__(self, inputs: int, outputs: int, widths: tuple[int, int, int, int]) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(_Block(inputs, widths[0], kernel=6, stride=STRIDE), _Block(widths[0], widths[0]))
+        pairs = list(zip(widths[:-1], widths[1:], strict=True))
+        self.down = nn.ModuleList([nn.Sequential(_Block(a, b, kernel=4, stride=2), _Block(b, b)) for a, b in pairs])
+        self.lateral = nn.ModuleList([nn.Conv2d(b, a, 1) for a, b in pairs])
+        self.up = nn.ModuleList([_Block(a, a) for a, _ in pairs])
+        self.head = nn.Conv2d(widths[0], outputs, 1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Features at half the resolution of the image."""
+        levels = [self.stem(image)]
+        for down in self.down:
+            levels.append(down(levels[-1]))
+        x = levels.pop()
+        for lateral, up in zip(reversed(self.lateral), reversed(self.up), strict=True):
+            skip = levels.pop()
+            coarse = nn.functional.interpolate(lateral(x), size=skip.shape[-2:], mode="bilinear", align_corners=False)
+            x = up(skip + coarse)
+        return self.head(x)
+
+
+class RotMatchNet(nn.Module):
+    """The two encoders and the scale of the score."""
+
+    def __init__(self, settings: RotMatchSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.scan_encoder = FeatureNet(len(BANDS_M), settings.channels + 1, settings.widths)
+        self.map_encoder = FeatureNet(3, settings.channels, settings.widths)
+        self.log_scale = nn.Parameter(torch.zeros(()))
+
+    def scan_features(self, density: Tensor) -> Tensor:
+        """(B, bands, n, n) log densities -> (B, C, n / 2, n / 2): unit vectors times the worth of their cell."""
+        raw = self.scan_encoder(density)
+        worth = torch.sigmoid(raw[:, -1:] - 3.0)
+        return nn.functional.normalize(raw[:, :-1], dim=1) * worth * self.log_scale.exp()
+
+    def map_features(self, picture: Tensor) -> Tensor:
+        """(B, 3, H, W) in [0, 1] -> (B, C, H / 2, W / 2) unit vectors."""
+        return nn.functional.normalize(self.map_encoder(picture), dim=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What is fitted on held-out data after training.
+
+    Attributes
+    ----------
+    temperature
+        Divides the scores.
+    error_correlation_length_m
+        Distance over which the errors of neighbouring frames decorrelate (1/e).
+    """
+
+    temperature: float = 1.0
+    error_correlation_length_m: float = 15.0
+
+
+class RotMatch:
+    """RotMatch as a measurement model; implements `learned.matcher.MapMatcher`.
+
+    Parameters
+    ----------
+    net
+        The encoders.
+    calibration
+        Temperature and error correlation, from held-out data.
+    yaw_bins
+        Heading bins over the full circle (360: 1 degree each).
+    """
+
+    def __init__(self, net: RotMatchNet, calibration: Calibration | None = None, yaw_bins: int = 360) -> None:
+        self.net = net.eval()
+        self.calibration = calibration or Calibration()
+        self.yaw_bins = yaw_bins
+
+    @property
+    def name(self) -> str:
+        """Short name for tables."""
+        return "rotmatch"
+
+    @property
+    def error_correlation_length_m(self) -> float:
+        """Distance over which errors decorrelate, metres."""
+        return self.calibration.error_correlation_length_m
+
+    def match(
+        self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
+    ) -> LikelihoodVolume:
+        """Likelihood of the poses in the search region; see `learned.matcher.MapMatcher.match`."""
+        bev = self.net.settings.bev
+        reach = bev.size / 2 * bev.metres_per_pixel
+        crop = map_raster.resampled(matching_window(map_raster, search, reach, bev.metres_per_pixel, multiple_of=16))
+        bins = yaw_bins_within(float(search.centre[2]), search.half_heading_rad, self.yaw_bins)
+        density = torch.from_numpy(log_density(bev_counts(points, ground_z, bev)))
+        picture = picture_tensor(crop.picture)
+        with torch.inference_mode():
+            scan = self.net.scan_features(density[None])[0]
+            features = self.net.map_features(picture[None])[0]
+            scores = vote(features, scan, bin_yaws(bins, self.yaw_bins)) / self.calibration.temperature
+        return volume_from_scores(scores, bins, self.yaw_bins, crop.grid, STRIDE)
+
+    @classmethod
+    def shipped(cls) -> Self:
+        """The weights that come with the package."""
+        with resources.as_file(resources.files("learned") / "weights" / "rotmatch.safetensors") as path:
+            return cls.load(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a checkpoint: weights in PATH (.safetensors), sizes and calibration in the .json beside it.
+
+        Raises
+        ------
+        SkyfixError
+            If a file is missing or unreadable, or was written for another architecture or other sizes.
+        """
+        sidecar = path.with_suffix(".json")
+        for file in (path, sidecar):
+            if not file.is_file():
+                raise SkyfixError(f"checkpoint: expected {file.name} at {file.parent}, got no such file")
+        try:
+            facts = json.loads(sidecar.read_text())
+            architecture = facts["architecture"]
+            if architecture != ARCHITECTURE:
+                raise SkyfixError(f"checkpoint {path.name}: expected architecture {ARCHITECTURE}, got {architecture}")
+            sizes = facts["settings"]
+            settings = RotMatchSettings(sizes["channels"], tuple(sizes["widths"]), BevSettings(**sizes["bev"]))
+            calibration = Calibration(**facts["calibration"])
+            net = RotMatchNet(settings)
+            net.load_state_dict(load_file(path))
+        except (json.JSONDecodeError, KeyError, TypeError, SafetensorError) as error:
+            raise SkyfixError(f"checkpoint {path.name}: expected a readable checkpoint, got {error!r}") from error
+        except RuntimeError as error:
+            what = str(error).splitlines()[-1].strip()
+            raise SkyfixError(f"checkpoint {path.name}: its weights do not fit its stated sizes: {what}") from error
+        return cls(net, calibration)
+
+    def save(self, path: Path, provenance: dict[str, object]) -> None:
+        """Write PATH (.safetensors) and the .json beside it; `provenance` says what data, seed and command made them."""
+        facts = {
+            "architecture": ARCHITECTURE,
+            "settings": asdict(self.net.settings),
+            "calibration": asdict(self.calibration),
+            "parameters": sum(p.numel() for p in self.net.parameters()),
+            **provenance,
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_file({name: tensor.contiguous() for name, tensor in self.net.state_dict().items()}, path)
+        path.with_suffix(".json").write_text(json.dumps(facts, indent=2) + "\n")
+
+
+def picture_tensor(picture: NDArray[np.uint8]) -> Tensor:
+    """(rows, cols, 3) uint8 -> (3, rows, cols) float32 in [0, 1]."""
+    return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float() / 255.0

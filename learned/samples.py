@@ -1,0 +1,145 @@
+"""Training samples: a scan's bird's-eye view, the map around the truth, and what augmentation does to them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion import se2
+from learned.bev import log_density
+from learned.map_raster import CLASS_INDEX, CLASSES, PALETTE
+
+_DROPPED_TOGETHER = (("wall", "fence", "hedge"), ("tree",), ("grass", "forest"), ("road",), ("path", "parking"), ("building",))
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One scan and the class raster around it.
+
+    Attributes
+    ----------
+    counts
+        (bands, n, n) uint8 point counts (capped at 255), body frame.
+    classes
+        (m, m) uint8 class indices, north up; large enough for every crop that training takes.
+    row, col
+        Where the vehicle truly is, continuous pixel coordinates of `classes`.
+    yaw
+        True heading, radians.
+    """
+
+    counts: NDArray[np.uint8]
+    classes: NDArray[np.uint8]
+    row: float
+    col: float
+    yaw: float
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """How samples are varied; probabilities apply to each sample."""
+
+    max_offset_px: int = 40
+    crop_px: int = 256
+    drop_class: float = 0.12
+    thin: float = 0.3
+    shorten: float = 0.2
+    drop_sector: float = 0.15
+    drop_band: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """What the network is given and what it should find.
+
+    Attributes
+    ----------
+    density
+        (bands, n, n) float32 log densities.
+    picture
+        (crop, crop, 3) uint8.
+    row, col, yaw
+        The truth in the crop: continuous pixel coordinates, radians.
+    """
+
+    density: NDArray[np.float32]
+    picture: NDArray[np.uint8]
+    row: float
+    col: float
+    yaw: float
+
+
+def augment(sample: Sample, rng: np.random.Generator, settings: Augmentation) -> Example:
+    """Turn, mirror, crop and impoverish a sample; deterministic in the generator."""
+    counts, classes, row, col, yaw = sample.counts, sample.classes, sample.row, sample.col, sample.yaw
+    size = classes.shape[0]
+    if rng.random() < 0.5:  # mirror about the east axis: north <-> south on the map, left <-> right of the vehicle
+        counts, classes, row, yaw = counts[:, ::-1], classes[::-1], size - row, -yaw
+    turns = int(rng.integers(4))
+    for _ in range(turns):  # rot90 turns the picture counter-clockwise
+        row, col = size - col, row
+    classes, yaw = np.rot90(classes, turns), yaw + turns * math.pi / 2
+    offset = rng.integers(-settings.max_offset_px, settings.max_offset_px + 1, size=2)
+    top, left = (round(v) - settings.crop_px // 2 + int(d) for v, d in zip((row, col), offset, strict=True))
+    top, left = (min(max(v, 0), size - settings.crop_px) for v in (top, left))
+    crop = classes[top : top + settings.crop_px, left : left + settings.crop_px]
+    return Example(
+        log_density(_impoverish_scan(counts.astype(np.float32), rng, settings)),
+        PALETTE[_drop_classes(crop, rng, settings.drop_class)],
+        row - top,
+        col - left,
+        float(se2.wrap(yaw)),
+    )
+
+
+def _drop_classes(crop: NDArray[np.uint8], rng: np.random.Generator, probability: float) -> NDArray[np.uint8]:
+    """Blank whole groups of classes, so that no class is relied upon alone; always the same number of draws."""
+    lookup = np.arange(len(CLASSES), dtype=np.uint8)
+    for group, drawn in zip(_DROPPED_TOGETHER, rng.random(len(_DROPPED_TOGETHER)), strict=True):
+        rarer = 0.4 if group == ("building",) else 1.0
+        if drawn < probability * rarer:
+            lookup[[CLASS_INDEX[name] for name in group]] = CLASS_INDEX["void"]
+    return lookup[crop]
+
+
+def _impoverish_scan(
+    counts: NDArray[np.float32], rng: np.random.Generator, settings: Augmentation
+) -> NDArray[np.float32]:
+    """Thin the beams, shorten the range, hide a sector (a lorry alongside), lose a height band."""
+    size = counts.shape[-1]
+    if rng.random() < settings.thin:
+        counts = rng.binomial(counts.astype(np.int64), rng.uniform(0.3, 1.0)).astype(np.float32)
+    offsets = np.arange(size) + 0.5 - size / 2
+    x, y = np.meshgrid(offsets, -offsets)
+    if rng.random() < settings.shorten:
+        counts = counts * (np.hypot(x, y) < rng.uniform(0.5, 1.0) * size / 2)
+    if rng.random() < settings.drop_sector:
+        away = se2.wrap(np.arctan2(y, x) - rng.uniform(-math.pi, math.pi))
+        counts = counts * (np.abs(away) > rng.uniform(0.1, 0.5))
+    if rng.random() < settings.drop_band:
+        counts = counts.copy()
+        counts[int(rng.integers(1, len(counts)))] = 0.0
+    return np.ascontiguousarray(counts, dtype=np.float32)
+
+
+def cut_sample(
+    counts: NDArray[np.float32], classes: NDArray[np.uint8], row: float, col: float, yaw: float, size: int
+) -> Sample:
+    """Cut `size` x `size` pixels about the vehicle out of a larger class raster (void outside) and pack the counts."""
+    top, left = round(row) - size // 2, round(col) - size // 2
+    padded = cv2.copyMakeBorder(
+        classes,
+        max(0, -top),
+        max(0, top + size - classes.shape[0]),
+        max(0, -left),
+        max(0, left + size - classes.shape[1]),
+        cv2.BORDER_CONSTANT,
+        value=0,
+    )
+    cut = padded[max(top, 0) : max(top, 0) + size, max(left, 0) : max(left, 0) + size]
+    packed = np.minimum(counts, 255).astype(np.uint8)
+    return Sample(packed, np.ascontiguousarray(cut, dtype=np.uint8), row - top, col - left, yaw)

@@ -1,0 +1,129 @@
+"""Rotated-template voting: score every pose of a window by correlating a scan's features with the map's.
+
+A scan's feature image, seen from above with the vehicle at its centre, is rotated to each candidate heading and correlated with
+the map's feature image; the correlation at a shift is the score of the pose that the shift stands for. It is exhaustive over
+position and heading, differentiable, and costs one FFT a channel and heading (OrienterNet, Sarlin et al., CVPR 2023, section 3.3,
+uses the same principle; Barsan et al., CoRL 2018, equation 3, is its origin).
+
+The vehicle stands on the corner between the template's four middle pixels, so candidate positions are pixel corners of the map
+window, and the grid of the scores is half a pixel off the map's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fusion.errors import SkyfixError
+from fusion.grid import MapGrid
+from fusion.likelihood import LikelihoodVolume
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+def rotate_templates(features: Tensor, yaws: Tensor) -> Tensor:
+    """Rotate body-frame feature images counter-clockwise to each heading, about their centre.
+
+    Parameters
+    ----------
+    features
+        (C, n, n), n even; body x along +columns, body y against rows.
+    yaws
+        (R,) radians.
+
+    Returns
+    -------
+    (R, C, n, n), bilinear, zero outside.
+    """
+    channels, size, _ = features.shape
+    cos, sin = torch.cos(yaws), torch.sin(yaws)
+    # Image axes are (x right, y down): a map-frame offset d is read at R(-yaw) d in the body frame.
+    row_x = torch.stack([cos, -sin, torch.zeros_like(cos)], dim=-1)
+    row_y = torch.stack([sin, cos, torch.zeros_like(cos)], dim=-1)
+    affine = torch.stack([row_x, row_y], dim=1).to(features.dtype)
+    flow = torch.nn.functional.affine_grid(affine, [len(yaws), channels, size, size], align_corners=False)
+    batch = features.expand(len(yaws), -1, -1, -1)
+    return torch.nn.functional.grid_sample(batch, flow, mode="bilinear", padding_mode="zeros", align_corners=False)
+
+
+def correlate(map_features: Tensor, templates: Tensor) -> Tensor:
+    """Correlate templates with the map wherever they lie wholly inside it.
+
+    Parameters
+    ----------
+    map_features
+        (C, H, W).
+    templates
+        (R, C, h, w) with h <= H and w <= W.
+
+    Returns
+    -------
+    (R, H - h + 1, W - w + 1): sum over channels and pixels of map[c, r + i, q + j] * template[c, i, j].
+    No shift wraps around: only shifts that keep the template inside are returned, so the map's own size is padding enough.
+    """
+    height, width = map_features.shape[-2:]
+    rows, cols = height - templates.shape[-2] + 1, width - templates.shape[-1] + 1
+    if rows < 1 or cols < 1:
+        raise SkyfixError(
+            f"voting: expected a template no larger than the map's {(height, width)}, got {tuple(templates.shape[-2:])}"
+        )
+    spectrum = torch.fft.rfft2(map_features)
+    product = (torch.fft.rfft2(templates, s=(height, width)).conj() * spectrum).sum(dim=1)
+    return torch.fft.irfft2(product, s=(height, width))[:, :rows, :cols]
+
+
+def vote(map_features: Tensor, scan_features: Tensor, yaws: Tensor, chunk: int = 16) -> Tensor:
+    """Score (R, rows, cols) of each heading in `yaws` (R,) and each position; `chunk` headings at a time bound the memory."""
+    blocks = [correlate(map_features, rotate_templates(scan_features, block)) for block in yaws.split(chunk)]
+    return torch.cat(blocks)
+
+
+def volume_from_scores(
+    scores: Tensor, bins: list[int], yaw_bins: int, map_grid: MapGrid, stride: int = 1
+) -> LikelihoodVolume:
+    """Make a likelihood of the scores (R, rows, cols) of some yaw bins; the other bins count as not evaluated.
+
+    Parameters
+    ----------
+    scores
+        What `vote` gave, already divided by a temperature.
+    bins
+        The bin of each of the R headings.
+    yaw_bins
+        Number of bins on the circle.
+    map_grid
+        The map window that was matched.
+    stride
+        Map pixels a feature cell.
+    """
+    _, rows, cols = scores.shape
+    mpp = map_grid.metres_per_pixel * stride
+    inset = (map_grid.width_m - cols * mpp) / 2
+    grid = MapGrid(rows, cols, mpp, map_grid.x0 + inset, map_grid.y0 + inset)
+    volume = np.zeros((rows, cols, yaw_bins), dtype=np.float32)
+    volume[:, :, bins] = scores.permute(1, 2, 0).numpy()
+    valid = np.zeros(yaw_bins, dtype=np.bool_)
+    valid[bins] = True
+    return LikelihoodVolume.from_scores(volume, grid, valid=valid)
+
+
+def yaw_bins_within(centre_rad: float, half_range_rad: float, bins: int) -> list[int]:
+    """Return the indices of the yaw bins (centre of bin k at 2 pi k / bins) that lie within a range about a centre."""
+    step = 2 * math.pi / bins
+    if half_range_rad >= math.pi - step / 2:
+        return list(range(bins))
+    first = math.ceil((centre_rad - half_range_rad) / step - 1e-9)
+    last = math.floor((centre_rad + half_range_rad) / step + 1e-9)
+    if last < first:
+        first = last = round(centre_rad / step)
+    return [k % bins for k in range(first, last + 1)]
+
+
+def bin_yaws(indices: Sequence[int], bins: int) -> Tensor:
+    """Yaw (R,) float32 of each bin index."""
+    return torch.tensor(indices, dtype=torch.float32) * (2 * math.pi / bins)

