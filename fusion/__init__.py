@@ -11,6 +11,7 @@ from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
+from fusion.particle_filter import ParticleFilter, ParticleFilterSettings, UpdateReport
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 
@@ -23,10 +24,13 @@ __all__ = [
     "OdometryIncrement",
     "OdometryNoise",
     "OutlierMixture",
+    "ParticleFilter",
+    "ParticleFilterSettings",
     "PoseLikelihood",
     "SkyfixError",
     "Trajectory",
     "UniformPrior",
+    "UpdateReport",
     "accumulate",
     "find_modes",
     "increments_at",

@@ -58,8 +58,8 @@ class OdometryIncrement:
 class OdometryNoise:
     """Random-walk errors of an odometry: variances grow with the distance driven and with time.
 
-    The heading error is a random walk along the way, so it also carries the position sideways; splitting a straight
-    drive into pieces and accumulating them gives the covariance of the whole.
+    The heading error is a random walk along the way, so it also carries the position sideways. Splitting a straight
+    drive at constant speed into pieces and accumulating them gives the covariance of the whole.
 
     Parameters
     ----------
@@ -92,18 +92,14 @@ class OdometryNoise:
         """Covariance (3, 3) of the increment `delta` (3,) that took `seconds`."""
         x, y, _ = checked("delta", delta, (3,))
         distance = float(np.hypot(x, y))
-        heading = self.heading_rad_per_sqrt_m**2  # random-walk intensity q, rad^2 / m
-        along_across = np.diag(
-            [
-                self.longitudinal_m_per_sqrt_m**2 * distance,
-                self.lateral_m_per_sqrt_m**2 * distance + heading * distance**3 / 3.0,
-                heading * distance,
-            ]
-        )
-        along_across[1, 2] = along_across[2, 1] = heading * distance**2 / 2.0
+        heading = self.heading_rad_per_sqrt_m**2 * distance + self.heading_rad_per_sqrt_s**2 * seconds
+        position = self.position_m_per_sqrt_s**2 * seconds
+        along = self.longitudinal_m_per_sqrt_m**2 * distance + position
+        across = self.lateral_m_per_sqrt_m**2 * distance + position + heading * distance**2 / 3.0
+        coupled = heading * distance / 2.0  # integral of a random walk: variance 1/3, covariance 1/2
+        covariance = np.array([[along, 0.0, 0.0], [0.0, across, coupled], [0.0, coupled, heading]])
         turn = se2.rotation(np.arctan2(y, x))
-        still = np.diag([self.position_m_per_sqrt_s**2, self.position_m_per_sqrt_s**2, self.heading_rad_per_sqrt_s**2])
-        return turn @ along_across @ turn.T + still * seconds
+        return turn @ covariance @ turn.T
 
 
 def increments_at(

@@ -1,0 +1,42 @@
+"""Regularisation: give the copies that resampling makes a life of their own, without widening the cloud.
+
+Each particle is drawn towards the mean of its cluster and gets kernel noise with the cluster's covariance,
+
+    x' = m + sqrt(1 - h^2) (x - m) + h L e,        L L^T = covariance,  e ~ N(0, I)
+
+which leaves mean and covariance of every cluster as they are. The bandwidth is Silverman's, times a scale.
+
+Source: Liu, West, "Combined parameter and state estimation in simulation-based filtering", 2001, section 10.2.3;
+Silverman, "Density estimation for statistics and data analysis", 1986, equation 4.14.
+"""
+
+import numpy as np
+
+from fusion import se2
+from fusion.arrays import FloatArray
+from fusion.clusters import find_clusters
+
+
+def matrix_root(covariance: FloatArray) -> FloatArray:
+    """A matrix R (..., 3, 3) with ``R R^T = covariance``; semidefinite matrices are welcome."""
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+
+
+def silverman_bandwidth(count: FloatArray, dimensions: int) -> FloatArray:
+    """Kernel width, in standard deviations, for a Gaussian sample of `count` points."""
+    return (4.0 / (count * (dimensions + 2.0))) ** (1.0 / (dimensions + 4.0))
+
+
+def regularised(particles: FloatArray, scale: float, rng: np.random.Generator) -> FloatArray:
+    """Equally weighted particles (N, 3) with kernel noise of `scale` times Silverman's bandwidth, 0 <= scale <= 1."""
+    if scale == 0.0:
+        return particles
+    clusters = find_clusters(particles, np.full(len(particles), 1.0 / len(particles)))
+    count = np.bincount(clusters.labels).astype(np.float64)
+    width = scale * silverman_bandwidth(count, 3)[clusters.labels, None]
+    kernel = matrix_root(clusters.covariances)[clusters.labels]
+    noise = np.einsum("nij,nj->ni", kernel, rng.standard_normal(particles.shape))
+    moved = clusters.means[clusters.labels] + np.sqrt(1.0 - width**2) * clusters.residuals(particles) + width * noise
+    moved[:, 2] = se2.wrap(moved[:, 2])
+    return moved
