@@ -1,0 +1,244 @@
+"""The `skyfix` command: a thin layer over the library. What it prints and writes is made elsewhere.
+
+Bad input is one line on standard error, `skyfix: error: ...`, and exit code 2. The heavy modules are imported by the
+commands that need them, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from fusion.errors import SkyfixError
+
+if TYPE_CHECKING:
+    from sequences.sequence import Sequence
+    from sequences.track_settings import TrackSettings
+
+app = typer.Typer(
+    name="skyfix",
+    help="Drift-free vehicle tracking: scans matched with a map, fused with odometry.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+MatcherOption = Annotated[
+    str,
+    typer.Option(
+        help="Matches scans with the map: rotmatch (learned, shipped), geometric (no learning) or a .safetensors file.",
+        metavar="NAME|FILE",
+    ),
+]
+SeedOption = Annotated[int, typer.Option(help="Of start, particles and simulated scans. Same seed, same numbers.")]
+OutOption = Annotated[
+    Path | None, typer.Option(help="Run directory to write. Default: runs/SEQUENCE-ODOMETRY-seedN.", metavar="DIR")
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in the directory.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+HeadingUnknownOption = Annotated[
+    bool, typer.Option("--heading-unknown", help="The start's heading may be anything, as with --half-heading-deg 180.")
+]
+HalfExtentOption = Annotated[
+    float, typer.Option(help="The start is known to within a square of this half side, metres.", metavar="M")
+]
+HalfHeadingOption = Annotated[
+    float, typer.Option(help="The start's heading is known to within this, degrees; at most 180.", metavar="DEG")
+]
+
+
+@app.command(epilog="Example: `skyfix demo --out runs/first`")
+def demo(
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    matcher: MatcherOption = "rotmatch",
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """The whole story with no data: about 2 km through Helsinki's streets, scans simulated, odometry that drifts."""
+    from sequences.demo import DemoSequence
+    from sequences.track_settings import TrackSettings
+
+    sequence = DemoSequence(seed)
+    _run(sequence, matcher, TrackSettings(default_odometry(sequence), seed=seed), out, overwrite, quiet)
+
+
+@app.command(
+    epilog="Examples:\n\n"
+    "`skyfix track drives/kitti_13 --odometry lidar_gicp`\n\n"
+    "`skyfix track drives/mine --start 12.5 -80 90 --half-extent 30 --heading-unknown --out runs/mine`"
+)
+def track(
+    sequence: Annotated[Path, typer.Argument(help="Folder with map.json, odometry/*.tum, scans/ (see the README).")],
+    odometry: Annotated[
+        str | None,
+        typer.Option(help="One of SEQUENCE/odometry/*.tum. Default: the first that is not emulated.", metavar="NAME"),
+    ] = None,
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    matcher: MatcherOption = "rotmatch",
+    start: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="Where the drive starts: metres, metres, degrees counter-clockwise from east, map frame. "
+            "Default: the true first pose plus a random offset within the start's box (needs ground truth).",
+            metavar="X Y YAW",
+        ),
+    ] = None,
+    half_extent: HalfExtentOption = 20.0,
+    half_heading_deg: HalfHeadingOption = 10.0,
+    heading_unknown: HeadingUnknownOption = False,
+    measure_every_m: Annotated[
+        float, typer.Option(help="Match a scan with the map every so many metres of odometry.", metavar="M")
+    ] = 4.0,
+    measure_every_frames: Annotated[
+        int | None, typer.Option(help="Match every so many frames instead.", metavar="N")
+    ] = None,
+    particles: Annotated[int, typer.Option(help="Number of particles.", metavar="N")] = 10_000,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Track one drive: particle filter and factor graph beside odometry, single shots and the prior.
+
+    Writes a run directory (metrics.json, report.html, trajectories) and prints the errors, when there is ground truth.
+    """
+    from sequences.folder import FolderSequence
+    from sequences.track_settings import TrackSettings
+
+    opened = FolderSequence(sequence, seed)
+    settings = TrackSettings(
+        odometry=odometry or default_odometry(opened),
+        seed=seed,
+        particles=particles,
+        half_extent_m=half_extent,
+        half_heading_deg=180.0 if heading_unknown else half_heading_deg,
+        start=start,
+        measure_every_m=measure_every_m,
+        measure_every_frames=measure_every_frames,
+    )
+    _run(opened, matcher, settings, out, overwrite, quiet)
+
+
+@app.command(epilog="Example: `skyfix evaluate drives/kitti_13 drives/kitti_360 --matcher geometric --json shots.json`")
+def evaluate(
+    sequences: Annotated[list[Path], typer.Argument(help="Sequence folders with ground truth.", metavar="SEQUENCE...")],
+    matcher: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="As for track; give it several times to compare. Default: rotmatch and geometric.", metavar="NAME|FILE"
+        ),
+    ] = None,
+    half_extent: HalfExtentOption = 20.0,
+    half_heading_deg: HalfHeadingOption = 10.0,
+    heading_unknown: HeadingUnknownOption = False,
+    max_frames: Annotated[int, typer.Option(help="Most scans of a sequence, spread evenly.", metavar="N")] = 200,
+    seed: SeedOption = 0,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Score single shots: each scan by itself from a start that is off, beside the prior's own score."""
+    from learned.matcher import load_matcher
+    from sequences.evaluate import evaluate_single_shot, markdown_table
+    from sequences.folder import FolderSequence
+
+    half_heading = 180.0 if heading_unknown else half_heading_deg
+    loaded = {name: load_matcher(name) for name in matcher or ["rotmatch", "geometric"]}
+    evaluations = [
+        evaluate_single_shot(FolderSequence(path, seed), loaded, half_extent, half_heading, max_frames, seed)
+        for path in sequences
+    ]
+    typer.echo(markdown_table(evaluations), nl=False)
+    if json_file is not None:
+        try:
+            json_file.write_text(json.dumps(evaluations, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise SkyfixError(f"{json_file}: cannot be written: {error.strerror}") from error
+
+
+@app.command(epilog="Example: `skyfix train rotmatch.yaml`")
+def train(config: Annotated[Path, typer.Argument(help="YAML file with the training's settings.")]) -> None:
+    """Train a matcher on scans simulated in OpenStreetMap extracts."""
+    from learned.training import train_from_config
+
+    train_from_config(config)
+
+
+@app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")
+def view(run: Annotated[Path, typer.Argument(help="Run directory.")]) -> None:
+    """Print the table of a run again, and where its report is."""
+    from sequences.run_directory import read_metrics
+
+    _show(read_metrics(run), run / "report.html")
+
+
+@app.callback(invoke_without_command=True)
+def _root(show_version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+    if show_version:
+        typer.echo(f"skyfix {version('skyfix')}")
+        raise typer.Exit
+
+
+def default_odometry(sequence: Sequence) -> str:
+    """The first odometry that is not emulated, or else the first.
+
+    Raises
+    ------
+    SkyfixError
+        If the sequence has none.
+    """
+    from sequences.sequence import odometry_is_emulated
+
+    if not sequence.odometry_names:
+        raise SkyfixError(f"{sequence.name}: has no odometry: expected odometry/NAME.tum")
+    return min(sequence.odometry_names, key=odometry_is_emulated)
+
+
+def _run(
+    sequence: Sequence, matcher_name: str, settings: TrackSettings, out: Path | None, overwrite: bool, quiet: bool
+) -> None:
+    from learned.matcher import load_matcher
+    from sequences.localize import track as track_drive
+    from sequences.progress import ConsoleProgress
+    from sequences.run_directory import check_target, write_run
+
+    out = out or Path("runs") / f"{sequence.name}-{settings.odometry}-seed{settings.seed}"
+    check_target(out, overwrite)
+    matcher = load_matcher(matcher_name)
+    with ConsoleProgress(Console(stderr=True, quiet=quiet), sequence.name) as progress:
+        result = track_drive(sequence, matcher, settings, progress)
+    _show(result.metrics, write_run(result, out, overwrite))
+
+
+def _show(metrics: dict[str, object], report: Path) -> None:
+    from sequences.tables import closing_lines, run_table
+
+    console = Console(highlight=False)
+    console.print(run_table(metrics))
+    for line in closing_lines(metrics):
+        console.print(line, soft_wrap=True)
+    console.print(f"report: {report}", soft_wrap=True)
+
+
+def main() -> None:
+    """Run the command line; the console script `skyfix`."""
+    try:
+        app()
+    except SkyfixError as error:
+        print(f"skyfix: error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("skyfix: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""The part of a sequence that can be tracked with one odometry: frames, odometry and truth at the same stamps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion import se2
+from fusion.arrays import FloatArray
+from fusion.errors import SkyfixError
+from fusion.trajectory import Trajectory
+from sequences.sequence import Sequence
+from sequences.trajectory_io import format_seconds
+
+STAMP_TOLERANCE_NS = 1_000_000
+"""Files round their seconds: a scan up to 1 ms outside a trajectory's span takes its end pose."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """Frames of a sequence that an odometry (and the truth, where there is one) covers.
+
+    Attributes
+    ----------
+    sequence
+        Where the scans and the map come from.
+    indices
+        (M,) scan index of each frame.
+    odometry
+        Odometry poses at the frames' stamps, in their own frame.
+    truth
+        True poses at the frames' stamps, or None.
+    """
+
+    sequence: Sequence
+    indices: NDArray[np.int64]
+    odometry: Trajectory
+    truth: Trajectory | None
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(M,) stamps of the frames."""
+        return self.odometry.stamp_ns
+
+    @property
+    def length_m(self) -> float:
+        """Path length of the truth, or of the odometry where there is none."""
+        return self.odometry.length_m if self.truth is None else self.truth.length_m
+
+
+def load_drive(sequence: Sequence, odometry_name: str) -> Drive:
+    """Bring scans, odometry and truth to common stamps.
+
+    Raises
+    ------
+    SkyfixError
+        If the odometry is unknown or unreadable, or it or the truth leaves fewer than two of the scans covered.
+    """
+    odometry = sequence.odometry(odometry_name)
+    truth = sequence.ground_truth
+    stamps = sequence.stamps_ns
+    covered = _covered(stamps, odometry, f"odometry {odometry_name!r}")
+    if truth is not None:
+        covered &= _covered(stamps, truth, "ground truth")
+    indices = np.flatnonzero(covered).astype(np.int64)
+    if len(indices) < 2:
+        raise SkyfixError(f"{sequence.name}: expected two scans covered by odometry and truth, got {len(indices)}")
+    used = stamps[indices]
+    return Drive(
+        sequence=sequence,
+        indices=indices,
+        odometry=_at(odometry, used),
+        truth=None if truth is None else _at(truth, used),
+    )
+
+
+def place_odometry(drive: Drive, start: FloatArray) -> Trajectory:
+    """The odometry alone, in the map frame, begun at `start` (3,)."""
+    moved = se2.between(drive.odometry.poses[:1], drive.odometry.poses)
+    return Trajectory(drive.stamps_ns, se2.compose(start[None], moved), None, "map")
+
+
+def _covered(stamps: NDArray[np.int64], trajectory: Trajectory, label: str) -> NDArray[np.bool_]:
+    first, last = trajectory.span_ns
+    covered = (stamps >= first - STAMP_TOLERANCE_NS) & (stamps <= last + STAMP_TOLERANCE_NS)
+    if not covered.any():
+        scans = f"{format_seconds(int(stamps[0]))} .. {format_seconds(int(stamps[-1]))} s"
+        span = f"{format_seconds(first)} .. {format_seconds(last)} s"
+        raise SkyfixError(f"{label}: expected an overlap in time with the scans ({scans}), got {span}")
+    return covered
+
+
+def _at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Trajectory:
+    poses = trajectory.interpolate(stamps, STAMP_TOLERANCE_NS)
+    return Trajectory(stamps, poses, None, trajectory.frame_id)

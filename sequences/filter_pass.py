@@ -1,0 +1,236 @@
+"""The online half of a tracked drive: odometry moves the particles, scans matched with the map weigh them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import logsumexp
+
+from fusion.arrays import FloatArray
+from fusion.consistency import correlated_error_temperature
+from fusion.estimate import Estimate
+from fusion.modes import GaussianMixture
+from fusion.odometry import OdometryIncrement
+from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.prior import UniformPrior
+from learned.matcher import MapMatcher, SearchRegion
+from sequences.drive import Drive
+from sequences.measurement import Measurement
+from sequences.run_result import FrameRow, Snapshot
+from sequences.search import first_search, next_search
+from sequences.sequence import ScanError
+from sequences.snapshots import take_snapshot
+from sequences.start import first_cloud
+from sequences.track_settings import TrackSettings
+from sequences.trajectory_io import format_seconds
+
+STAGES = ("scan", "match", "predict", "update")
+_FILTER_STREAM, _CLOUD_STREAM = 1, 3
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Milliseconds by stage."""
+
+    milliseconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time what is inside as a stage."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.milliseconds[stage] = 1e3 * (time.perf_counter() - begin)
+
+
+class FilterPass:
+    """Runs the filter over a drive, one frame a call of `step`.
+
+    Attributes
+    ----------
+    estimates, rows, modes
+        One entry for every frame so far; the modes are None at frames without a measurement.
+    best
+        Frame number -> the measurement's own best pose (3,), at the measured frames.
+    snapshots
+        A few measured frames, spread evenly over the way.
+    log
+        What a person may want to know afterwards.
+
+    Parameters
+    ----------
+    drive
+        The frames.
+    increments
+        Odometry from each frame to the next.
+    matcher, prior, settings
+        The measurement model, the start, everything else.
+    """
+
+    def __init__(
+        self,
+        drive: Drive,
+        increments: list[OdometryIncrement],
+        matcher: MapMatcher,
+        prior: UniformPrior,
+        settings: TrackSettings,
+    ) -> None:
+        self.estimates: list[Estimate] = []
+        self.rows: list[FrameRow] = []
+        self.modes: list[GaussianMixture | None] = []
+        self.best: dict[int, FloatArray] = {}
+        self.snapshots: list[Snapshot] = []
+        self.log: list[str] = []
+        self._drive, self._increments, self._matcher = drive, increments, matcher
+        self._prior, self._settings = prior, settings
+        own = matcher.error_correlation_length_m
+        self._correlation_m = own if settings.correlation_length_m is None else settings.correlation_length_m
+        self._filter: ParticleFilter | None = None
+        self._travelled_m = 0.0
+        self._measured_at_m = 0.0
+        self._frames_since_measured = 0
+        self._lost_streak = 0
+
+    def step(self, frame: int) -> FrameRow:
+        """Process one frame; frames come in order from 0.
+
+        Raises
+        ------
+        ScanError
+            If the first scan cannot be used; a later one is skipped, with the reason in its row and the log.
+        """
+        watch, reason, evidence = Stopwatch(), "", None
+        measurement: Measurement | None
+        if self._filter is None:
+            measurement = self._measure(frame, first_search(self._prior, self._settings), watch)
+            with watch("update"):
+                self._filter, evidence = self._start(measurement)
+        else:
+            with watch("predict"):
+                self._move(self._filter, frame)
+            measurement, reason = self._measure_if_due(self._filter, frame, watch)
+            if measurement is not None:
+                evidence = self._update(self._filter, frame, measurement, watch)
+        estimate = self._filter.estimate(self._stamp(frame))
+        self._keep(frame, estimate, measurement)
+        self.rows.append(
+            FrameRow(
+                index=int(self._drive.indices[frame]),
+                stamp_ns=self._stamp(frame),
+                measured=measurement is not None,
+                skipped_reason=reason,
+                log_evidence=evidence,
+                effective_sample_size=estimate.effective_sample_size,
+                lost_score=estimate.lost_score,
+                temperature=None if measurement is None else measurement.temperature,
+                search_half_extent_m=None if measurement is None else measurement.search.half_extent_m,
+                search_half_heading_rad=None if measurement is None else measurement.search.half_heading_rad,
+                milliseconds=watch.milliseconds,
+            )
+        )
+        return self.rows[-1]
+
+    def _move(self, particles: ParticleFilter, frame: int) -> None:
+        increment = self._increments[frame - 1]
+        particles.predict(increment)
+        self._travelled_m += float(np.hypot(*increment.delta[:2]))
+        self._frames_since_measured += 1
+
+    def _due(self) -> bool:
+        if self._settings.measure_every_frames is not None:
+            return self._frames_since_measured >= self._settings.measure_every_frames
+        return self._travelled_m - self._measured_at_m >= self._settings.measure_every_m
+
+    def _looks_lost(self) -> bool:
+        return self._lost_streak >= self._settings.lost_patience
+
+    def _measure_if_due(
+        self, particles: ParticleFilter, frame: int, watch: Stopwatch
+    ) -> tuple[Measurement | None, str]:
+        """The measurement, or None and (when one was due) why there is none."""
+        if not self._due():
+            return None, ""
+        prediction = particles.estimate(self._stamp(frame))
+        if not self._drive.sequence.map.grid.contains(prediction.pose[:2]):
+            reason = "the prediction lies outside the map"
+        else:
+            search = next_search(prediction, self._prior, self._settings, self._looks_lost())
+            try:
+                return self._measure(frame, search, watch), ""
+            except ScanError as error:
+                reason = str(error)
+        self._note(frame, f"not measured: {reason}")
+        return None, reason
+
+    def _measure(self, frame: int, search: SearchRegion, watch: Stopwatch) -> Measurement:
+        sequence = self._drive.sequence
+        with watch("scan"):
+            points = sequence.scan(int(self._drive.indices[frame]))
+        with watch("match"):
+            likelihood = self._matcher.match(points, sequence.ground_z, sequence.map, search)
+        return Measurement(points, search, likelihood, self._temperature())
+
+    def _temperature(self) -> float:
+        """1 for the first measurement of a drive, more when little way lies between two of them."""
+        if self._filter is None or self._correlation_m == 0.0:
+            return 1.0
+        return correlated_error_temperature(self._travelled_m - self._measured_at_m, self._correlation_m)
+
+    def _start(self, measurement: Measurement) -> tuple[ParticleFilter, float]:
+        """The filter after the first measurement, and the ln density that it gave to the start's box."""
+        settings, likelihood = self._settings, measurement.likelihood
+        rng = np.random.default_rng([settings.seed, _CLOUD_STREAM])
+        cloud = first_cloud(likelihood, self._prior, settings.particles, settings.outlier_probability, rng)
+        density = likelihood.log_density(self._prior.sample(settings.particles, rng))
+        particles = ParticleFilter(
+            cloud,
+            np.random.default_rng([settings.seed, _FILTER_STREAM]),
+            ParticleFilterSettings(outlier_probability=settings.outlier_probability),
+        )
+        return particles, float(logsumexp(density) - np.log(len(density)))
+
+    def _update(self, particles: ParticleFilter, frame: int, measurement: Measurement, watch: Stopwatch) -> float:
+        with watch("update"):
+            report = particles.update(measurement.likelihood, measurement.temperature)
+        if report.injected:
+            self._note(frame, f"evidence collapsed: {report.injected} particles drawn anew from the measurement")
+        return report.log_evidence
+
+    def _keep(self, frame: int, estimate: Estimate, measurement: Measurement | None) -> None:
+        self.estimates.append(estimate)
+        self.modes.append(None if measurement is None else measurement.modes(self._settings.modes))
+        if measurement is None:
+            return
+        self.best[frame] = measurement.best_pose()
+        self._measured_at_m, self._frames_since_measured = self._travelled_m, 0
+        self._watch_for_loss(frame, estimate.lost_score)
+        due_at_m = len(self.snapshots) * self._drive.odometry.length_m / self._settings.snapshots
+        if len(self.snapshots) < self._settings.snapshots and self._travelled_m >= due_at_m:
+            sequence, truth = self._drive.sequence, self._drive.truth
+            self.snapshots.append(
+                take_snapshot(
+                    frame,
+                    measurement,
+                    sequence.map,
+                    sequence.ground_z,
+                    estimate.pose,
+                    None if truth is None else truth.poses[frame],
+                )
+            )
+
+    def _watch_for_loss(self, frame: int, lost_score: float) -> None:
+        was_lost = self._looks_lost()
+        self._lost_streak = self._lost_streak + 1 if lost_score > self._settings.lost_threshold else 0
+        if self._looks_lost() and not was_lost:
+            self._note(frame, f"lost score {lost_score:.2f}: searching widely")
+
+    def _stamp(self, frame: int) -> int:
+        return int(self._drive.stamps_ns[frame])
+
+    def _note(self, frame: int, text: str) -> None:
+        self.log.append(f"frame {self._drive.indices[frame]} ({format_seconds(self._stamp(frame))} s): {text}")

@@ -1,0 +1,122 @@
+"""Track a drive: the loop from a sequence, a matcher and an odometry to trajectories and numbers.
+
+Online, a particle filter is moved by the odometry and weighed by scans matched with the map (`filter_pass`);
+afterwards a factor graph smooths all frames at once from the same increments and the modes of the same likelihoods.
+Ground truth, where there is any, draws the start and scores the result; it is never tracked with.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from fusion.factor_graph import smooth
+
+from fusion.odometry import increments_at
+from fusion.trajectory import Trajectory
+from learned.matcher import MapMatcher
+from sequences.drive import Drive, load_drive, place_odometry
+from sequences.filter_pass import FilterPass
+from sequences.metrics import position_errors
+from sequences.run_metrics import run_metrics
+from sequences.run_result import FrameRow, RunResult, Snapshot
+from sequences.sequence import Sequence
+from sequences.start import start_prior
+from sequences.track_settings import TrackSettings
+
+__all__ = ["FrameRow", "Progress", "RunResult", "Snapshot", "TrackSettings", "track"]
+
+
+class Progress(Protocol):
+    """Told how a drive is going."""
+
+    def start(self, frames: int) -> None:
+        """The drive has so many frames."""
+        ...
+
+    def frame(self, row: FrameRow, error_m: float | None) -> None:
+        """A frame is done; the filter's position error when the truth is known."""
+        ...
+
+
+def track(
+    sequence: Sequence, matcher: MapMatcher, settings: TrackSettings, progress: Progress | None = None
+) -> RunResult:
+    """Track one drive with one odometry.
+
+    Parameters
+    ----------
+    sequence
+        Scans, map, odometry.
+    matcher
+        Turns a scan and a map into a likelihood.
+    settings
+        Everything else; with the same settings the result is the same, times apart.
+    progress
+        Told about every frame.
+
+    Raises
+    ------
+    SkyfixError
+        If the odometry is unknown or does not overlap the scans, the start is outside the map or cannot be had, the
+        first scan cannot be used, or the matcher cannot use the map.
+    """
+    drive = load_drive(sequence, settings.odometry)
+    prior = start_prior(drive, settings)
+    increments = increments_at(drive.stamps_ns, drive.odometry, settings.noise)
+    online = FilterPass(drive, increments, matcher, prior, settings)
+    if progress is not None:
+        progress.start(len(drive.indices))
+    for frame in range(len(drive.indices)):
+        row = online.step(frame)
+        if progress is not None:
+            progress.frame(row, _error(drive, online, frame))
+    filtered = Trajectory(
+        drive.stamps_ns,
+        np.array([estimate.pose for estimate in online.estimates]),
+        np.array([estimate.covariance for estimate in online.estimates]),
+        "map",
+    )
+    begin = time.perf_counter()
+    smoothed = smooth(drive.stamps_ns, increments, online.modes, prior, filtered)
+    smoothing_s = time.perf_counter() - begin
+    measured = sorted(online.best)
+    result = RunResult(
+        sequence_name=sequence.name,
+        matcher_name=matcher.name,
+        settings=settings,
+        prior=prior,
+        stamps_ns=drive.stamps_ns,
+        truth=drive.truth,
+        odometry=place_odometry(drive, prior.mean),
+        single_shot=Trajectory(
+            drive.stamps_ns[measured], np.array([online.best[frame] for frame in measured]), None, "map"
+        ),
+        filter=filtered,
+        smoother=smoothed.trajectory,
+        frame_rows=online.rows,
+        snapshots=online.snapshots,
+        metrics={},
+        map=sequence.map,
+        scans_simulated=sequence.scans_simulated,
+        odometry_source=settings.odometry,
+        length_m=drive.length_m,
+        log=[*_described(drive), *online.log],
+    )
+    return replace(result, metrics=run_metrics(result, smoothing_s))
+
+
+def _error(drive: Drive, online: FilterPass, frame: int) -> float | None:
+    if drive.truth is None:
+        return None
+    return float(position_errors(drive.truth.poses[[frame]], online.estimates[frame].pose[None])[0])
+
+
+def _described(drive: Drive) -> list[str]:
+    total = len(drive.sequence.stamps_ns)
+    lines = [f"{len(drive.indices)} of {total} frames, {drive.length_m:.0f} m"]
+    if len(drive.indices) < total:
+        lines.append(f"{total - len(drive.indices)} frames left out: not covered by the odometry or the ground truth")
+    return lines

@@ -1,0 +1,108 @@
+"""Everything that a tracked drive depends on besides the sequence and the matcher. It is written out with every run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+from fusion.errors import SkyfixError
+from fusion.odometry import OdometryNoise
+
+
+@dataclass(frozen=True, slots=True)
+class TrackSettings:
+    """Settings of `localize.track`; every number that a person may want to change. Checked when made.
+
+    Attributes
+    ----------
+    odometry
+        Name of the odometry that the sequence offers.
+    seed
+        Of the start, the particles and the simulated scans. Same seed, same result.
+    particles
+        Number of particles.
+    half_extent_m, half_heading_deg
+        The start is known to within a square of this half side and to within this heading. 180 means that it is
+        unknown.
+    start
+        Centre of that box, x and y in metres and yaw in degrees in the map frame. None: the true first pose plus an
+        offset drawn uniformly from the box, which needs ground truth.
+    measure_every_m
+        A scan is matched with the map when the odometry has moved this far since the last one that was.
+    measure_every_frames
+        When given, every so many frames instead.
+    search_min_half_extent_m, search_max_half_extent_m
+        Bounds of the searched square's half side. The search also covers the whole start box until the position is
+        known.
+    search_min_half_heading_deg
+        Least half width of the searched headings.
+    search_margin_m
+        Added to the start box in the first search, so that a truth at its edge still has its surroundings.
+    search_sigmas
+        The search reaches this many standard deviations of the prediction.
+    correlation_length_m
+        Distance over which a matcher's errors resemble each other. None: the matcher's own.
+    outlier_probability
+        Chance that a measurement says nothing about the pose.
+    modes
+        Gaussians kept of each measurement for the smoother.
+    lost_threshold, lost_patience
+        The search is widened after so many measurements in a row with a lost score above the threshold.
+    snapshots
+        Measured frames kept for the report.
+    noise
+        The odometry's noise, standard deviations that grow with the root of the distance.
+    """
+
+    odometry: str
+    seed: int = 0
+    particles: int = 10_000
+    half_extent_m: float = 20.0
+    half_heading_deg: float = 10.0
+    start: tuple[float, float, float] | None = None
+    measure_every_m: float = 4.0
+    measure_every_frames: int | None = None
+    search_min_half_extent_m: float = 12.0
+    search_max_half_extent_m: float = 24.0
+    search_min_half_heading_deg: float = 6.0
+    search_margin_m: float = 2.0
+    search_sigmas: float = 3.5
+    correlation_length_m: float | None = None
+    outlier_probability: float = 0.05
+    modes: int = 5
+    lost_threshold: float = 0.5
+    lost_patience: int = 3
+    snapshots: int = 6
+    noise: OdometryNoise = field(default_factory=OdometryNoise)
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            numbers = value if isinstance(value, tuple) else (value,)
+            if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
+                raise SkyfixError(f"{entry.name}: expected a finite number, got {value}")
+        positive = ("particles", "half_extent_m", "half_heading_deg", "modes", "lost_patience", "search_sigmas")
+        lengths = ("search_min_half_extent_m", "search_max_half_extent_m", "search_min_half_heading_deg")
+        for name in (*positive, *lengths):
+            if getattr(self, name) <= 0:
+                raise SkyfixError(f"{name}: expected more than 0, got {getattr(self, name)}")
+        if self.half_heading_deg > 180.0:
+            raise SkyfixError(f"half_heading_deg: expected at most 180, got {self.half_heading_deg:g}")
+        if self.measure_every_m < 0.0:
+            raise SkyfixError(f"measure_every_m: expected 0 or more, got {self.measure_every_m:g}")
+        if self.measure_every_frames is not None and self.measure_every_frames < 1:
+            raise SkyfixError(f"measure_every_frames: expected 1 or more, got {self.measure_every_frames}")
+        if self.correlation_length_m is not None and self.correlation_length_m < 0.0:
+            raise SkyfixError(f"correlation_length_m: expected 0 or more, got {self.correlation_length_m:g}")
+        if self.seed < 0:
+            raise SkyfixError(f"seed: expected 0 or more, got {self.seed}")
+
+    @property
+    def heading_unknown(self) -> bool:
+        """Whether the start's heading is anything."""
+        return self.half_heading_deg >= 180.0
+
+    @property
+    def half_heading_rad(self) -> float:
+        """Half width of the start's headings, radians."""
+        return math.radians(self.half_heading_deg)

@@ -1,0 +1,119 @@
+"""Trajectories as TUM text files: a line is `t x y z qx qy qz qw`, seconds and metres, `#` starts a comment.
+
+Seconds are decimal text and stamps are int64 nanoseconds, so the conversion goes through `decimal`: a float would
+lose the last digits of a Unix time. The z coordinate, roll and pitch are dropped on reading and written as zero.
+Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.errors import SkyfixError
+from fusion.trajectory import Trajectory
+
+_NS_PER_S = 1_000_000_000
+_TUM_COLUMNS = 8
+
+
+def read_tum(path: Path, frame_id: str = "map") -> Trajectory:
+    """Read a TUM file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    frame_id
+        The frame that the poses are in (`map`, or a name of the odometry's own).
+
+    Raises
+    ------
+    SkyfixError
+        If the file is missing, empty or unreadable, a line is not eight finite numbers, a quaternion has no length,
+        or a stamp does not increase. The message names the file and the line.
+    """
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, fields in _lines(path):
+        if len(fields) != _TUM_COLUMNS:
+            raise SkyfixError(
+                f"{path.name}: line {number}: expected 8 numbers (t x y z qx qy qz qw), got {len(fields)}"
+            )
+        stamps.append(_stamp(fields[0], path, number, stamps))
+        rows.append([_number(field, path, number) for field in fields[1:]])
+        if np.linalg.norm(rows[-1][3:]) < 1e-6:
+            raise SkyfixError(f"{path.name}: line {number}: expected a unit quaternion, got zero length")
+    if not stamps:
+        raise SkyfixError(f"{path.name}: expected at least one pose, got none")
+    values = np.array(rows, dtype=np.float64)
+    poses = np.column_stack([values[:, 0], values[:, 1], _yaw(values[:, 3:])])
+    return Trajectory(np.array(stamps, dtype=np.int64), poses, None, frame_id)
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write stamps and planar poses (z, roll and pitch zero). Stamps survive to the nanosecond."""
+    lines = []
+    for stamp, (x, y, yaw) in zip(trajectory.stamp_ns.tolist(), trajectory.poses.tolist(), strict=True):
+        rotation = f"0.000000000000 0.000000000000 {np.sin(0.5 * yaw):.12f} {np.cos(0.5 * yaw):.12f}"
+        lines.append(f"{format_seconds(stamp)} {x:.9f} {y:.9f} 0.000000000 {rotation}\n")
+    path.write_text("".join(lines), encoding="ascii")
+
+
+def read_times(path: Path) -> NDArray[np.int64]:
+    """Read `times.txt` (seconds, one a line) as (N,) int64 nanoseconds; raises `SkyfixError` as `read_tum` does."""
+    stamps: list[int] = []
+    for number, fields in _lines(path):
+        if len(fields) != 1:
+            raise SkyfixError(f"{path.name}: line {number}: expected one number (seconds), got {len(fields)}")
+        stamps.append(_stamp(fields[0], path, number, stamps))
+    if not stamps:
+        raise SkyfixError(f"{path.name}: expected at least one stamp, got none")
+    return np.array(stamps, dtype=np.int64)
+
+
+def format_seconds(stamp_ns: int) -> str:
+    """Nanoseconds as exact decimal seconds with nine digits."""
+    sign, magnitude = ("-" if stamp_ns < 0 else ""), abs(stamp_ns)
+    return f"{sign}{magnitude // _NS_PER_S}.{magnitude % _NS_PER_S:09d}"
+
+
+def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise SkyfixError(f"{path}: cannot be read: {reason}") from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        content = line.split("#", 1)[0].split()
+        if content:
+            yield number, content
+
+
+def _stamp(field: str, path: Path, number: int, earlier: list[int]) -> int:
+    _number(field, path, number)
+    stamp = int((Decimal(field) * _NS_PER_S).to_integral_value())
+    if earlier and stamp <= earlier[-1]:
+        before = format_seconds(earlier[-1])
+        raise SkyfixError(f"{path.name}: line {number}: stamps must increase, got {field} s after {before} s")
+    return stamp
+
+
+def _number(field: str, path: Path, number: int) -> float:
+    try:
+        value = float(Decimal(field))
+    except InvalidOperation:
+        raise SkyfixError(f"{path.name}: line {number}: expected a number, got {field!r}") from None
+    if not np.isfinite(value):
+        raise SkyfixError(f"{path.name}: line {number}: expected a finite number, got {field}")
+    return value
+
+
+def _yaw(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Yaw (N,) in [-pi, pi] of quaternions (N, 4) ordered x, y, z, w, of any length above zero."""
+    x, y, z, w = quaternions.T / np.linalg.norm(quaternions, axis=1)
+    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
