@@ -24,12 +24,12 @@ _REFLECTANCE = np.array([0.25, 0.2, 0.4, 0.35, 0.3, 0.35, 0.35, 0.5, 0.3, 0.05],
 _DROP_OUT = np.array([0.0, 0.02, 0.06, 0.02, 0.03, 0.02, 0.12, 0.03, 0.02, 0.8], dtype=np.float32)
 
 
-def hdl64_elevations_deg() -> NDArray[np.float64]:
+def hdl64_elevations_deg() -> NDArray[np.floating]:
     """Elevations (64,) of an HDL-64E: 32 beams from +2 by 1/3 degree, 32 from -8.83 to -24.8 by about 1/2 degree."""
     return np.concatenate([2.0 - np.arange(32) * (10.33 / 31.0), -8.83 - np.arange(32) * (15.97 / 31.0)])
 
 
-def hdl32_elevations_deg() -> NDArray[np.float64]:
+def hdl32_elevations_deg() -> NDArray[np.floating]:
     """Elevations (32,) of an HDL-32E: +10.67 to -30.67 by 4/3 degree."""
     return 10.67 - np.arange(32) * (41.34 / 31.0)
 
@@ -54,8 +54,13 @@ class LidarModel:
         Share of facade patches (about 1 x 1 m) that are glass and return nothing.
     mount_height_m
         Sensor above the ground.
+    rear_shadow_deg, front_shadow_deg
+        Beams lower than this elevation meet the vehicle itself within 22 degrees of straight back or 30 degrees of
+        straight ahead.
+    mount_pitch_deg, mount_roll_deg
+        Constant tilt of the sensor against the vehicle: nose up, left side up.
     tilt_noise_deg
-        Standard deviation of roll and pitch beside what the terrain makes of them.
+        Standard deviation of roll and pitch of each scan beside that and what the terrain makes of them.
     """
 
     elevations_deg: tuple[float, ...] = tuple(hdl64_elevations_deg())
@@ -67,6 +72,10 @@ class LidarModel:
     drop_out: float = 0.03
     glass_share: float = 0.12
     mount_height_m: float = 1.73
+    rear_shadow_deg: float = -90.0
+    front_shadow_deg: float = -90.0
+    mount_pitch_deg: float = 0.0
+    mount_roll_deg: float = 0.0
     tilt_noise_deg: float = 0.4
 
     def __post_init__(self) -> None:
@@ -89,15 +98,19 @@ class LidarModel:
         else:
             elevations = np.linspace(rng.uniform(2.0, 15.0), rng.uniform(-25.0, -15.0), int(rng.integers(32, 129)))
         return cls(
-            tuple(float(e) for e in elevations + rng.normal(0.0, 0.03, len(elevations))),
+            tuple(float(e) for e in elevations + rng.uniform(0.0, 0.6) + rng.normal(0.0, 0.03, len(elevations))),
             azimuths,
-            min_range_m=float(rng.uniform(1.8, 3.0)),
+            min_range_m=float(rng.uniform(1.3, 3.0)),
             max_range_m=float(rng.uniform(70.0, 100.0)),
             range_noise_m=float(rng.uniform(0.01, 0.04)),
             beam_bias_m=float(rng.uniform(0.0, 0.03)),
-            drop_out=float(rng.uniform(0.0, 0.12)),
-            glass_share=float(rng.uniform(0.0, 0.3)),
-            mount_height_m=float(rng.normal(1.75, 0.06)) if kind < 0.7 else float(rng.uniform(1.6, 2.1)),
+            drop_out=float(rng.uniform(0.0, 0.06)),
+            glass_share=float(rng.uniform(0.0, 0.25)),
+            mount_height_m=float(rng.normal(1.7, 0.08)) if kind < 0.7 else float(rng.uniform(1.6, 2.1)),
+            rear_shadow_deg=float(rng.uniform(-25.0, -12.0)),
+            front_shadow_deg=float(rng.uniform(-30.0, -18.0)),
+            mount_pitch_deg=float(rng.normal(-0.4, 0.4)),
+            mount_roll_deg=float(rng.normal(0.0, 1.2)),
             tilt_noise_deg=float(rng.uniform(0.1, 0.8)),
         )
 
@@ -136,7 +149,8 @@ def simulate_scan(
         raise SkyfixError(f"lidar: expected a pose inside the world, got ({pose[0]:.1f}, {pose[1]:.1f})")
     rng = np.random.default_rng(rng)
     height, pitch, roll = _attitude(world, pose)
-    pitch, roll = np.array([pitch, roll]) + np.deg2rad(model.tilt_noise_deg) * rng.standard_normal(2)
+    mount = np.array([model.mount_pitch_deg, model.mount_roll_deg])
+    pitch, roll = np.array([pitch, roll]) + np.deg2rad(mount + model.tilt_noise_deg * rng.standard_normal(2))
     elevations = np.sort(np.deg2rad(np.array(model.elevations_deg)))
     bias = model.beam_bias_m * rng.standard_normal(len(elevations))
     azimuths = (np.arange(model.azimuths) + rng.random()) * (2.0 * np.pi / model.azimuths)
@@ -160,7 +174,7 @@ def simulate_scan(
         model.glass_share,
         np.uint32(rng.integers(0, 2**32, dtype=np.uint64)),
     )
-    hit_azimuth, hit_beam = np.nonzero(distance > 0.0)
+    hit_azimuth, hit_beam = np.nonzero((distance > 0.0) & ~_ego_shadow(model, azimuths, elevations))
     hit_kind = kind[hit_azimuth, hit_beam]
     kept = rng.random(len(hit_kind)) >= 1.0 - (1.0 - model.drop_out) * (1.0 - _DROP_OUT[hit_kind])
     hit_azimuth, hit_beam, hit_kind = hit_azimuth[kept], hit_beam[kept], hit_kind[kept]
@@ -177,6 +191,15 @@ def simulate_scan(
     points[:, 2] = reach * np.sin(elevations)[hit_beam]
     points[:, 3] = reflectance
     return points
+
+
+def _ego_shadow(model: LidarModel, azimuths: NDArray[np.float64], elevations: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which (azimuths, beams) the vehicle itself blocks."""
+    lowest = np.full(len(azimuths), -np.pi)
+    lowest[np.cos(azimuths) > np.cos(np.deg2rad(30.0))] = np.deg2rad(model.front_shadow_deg)
+    lowest[np.cos(azimuths) < -np.cos(np.deg2rad(22.0))] = np.deg2rad(model.rear_shadow_deg)
+    shadow: NDArray[np.bool_] = elevations[None, :] < lowest[:, None]
+    return shadow
 
 
 def _attitude(world: World, pose: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -8,6 +8,7 @@ are passed in fixed point with `SHIFT` fractional bits.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -25,8 +26,15 @@ Raster = NDArray[Any]
 
 def fixed_point(grid: MapGrid, xy: NDArray[np.float64]) -> NDArray[np.int32]:
     """Map-frame points (N, 2) as OpenCV (column, row) in fixed point, shape (N, 1, 2)."""
-    rc = grid.pixel_from_xy(np.asarray(xy, dtype=np.float64).reshape(-1, 2)) - 0.5
-    return np.clip(np.rint(rc[:, None, ::-1] * _SCALE), -_LIMIT, _LIMIT).astype(np.int32)
+    origin, per_metre = _fixed_point_map(grid)
+    return np.rint(xy.reshape(-1, 1, 2) * per_metre + origin).clip(-_LIMIT, _LIMIT).astype(np.int32)
+
+
+@lru_cache(maxsize=64)
+def _fixed_point_map(grid: MapGrid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where (0, 0) lies in fixed point (column, row), and fixed-point units per metre of x and y, both (2,)."""
+    zero, one = ((grid.pixel_from_xy((value, value)) - 0.5)[::-1] * _SCALE for value in (0.0, 1.0))
+    return zero, one - zero
 
 
 def fill(raster: Raster, grid: MapGrid, rings: Sequence[NDArray[np.float64]], value: float) -> None:

@@ -100,7 +100,7 @@ def sample_road_poses(
     for line in _roads(features.within(inner).lines):
         points, yaw = world_roads.resampled(line.points, 2.0)
         turned = np.where((rng.random(len(points)) < 0.5) & (not line.one_way), np.pi, 0.0)
-        lane = -rng.uniform(0.0, 0.45, len(points)) * line.width_m
+        lane = -rng.uniform(0.0, 0.35, len(points)) * line.width_m
         heading = yaw + turned
         spots = points + lane[:, None] * np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
         candidates.append(np.column_stack([spots, heading + rng.normal(0.0, 0.06, len(points))]))
@@ -110,7 +110,7 @@ def sample_road_poses(
     low = np.array([inner.x0 + margin_m, inner.y0 + margin_m])
     high = np.array([inner.x0 + inner.width_m - margin_m, inner.y0 + inner.height_m - margin_m])
     inside = np.all((poses[:, :2] > low) & (poses[:, :2] < high), axis=1)
-    poses = poses[inside & world.is_free(poses[:, :2], 1.2)]
+    poses = poses[inside & world.is_free(poses[:, :2], 1.6)]
     chosen: NDArray[np.float64] = poses[rng.permutation(len(poses))[:number]]
     chosen[:, 2] = np.mod(chosen[:, 2] + np.pi, 2.0 * np.pi) - np.pi
     return chosen

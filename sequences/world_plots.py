@@ -118,7 +118,7 @@ def add_boundary(
         else:
             layer.line(boundary.points, 0.1, top, Material.FENCE, 0.0, rng.uniform(0.6, 7.0))
     elif boundary.kind == "hedge":
-        top = height_m if known else rng.uniform(0.7, 2.6)
+        top = height_m if known else rng.choice((rng.uniform(0.7, 2.0), rng.uniform(1.5, 4.0)))
         layer.line(boundary.points, rng.uniform(0.5, 1.3), top, Material.FOLIAGE, 0.0, foliage)
     else:
         points, _ = resampled(boundary.points, rng.uniform(0.8, 2.5))

@@ -97,7 +97,7 @@ def add_parked_cars(layers: WorldLayers, roads: list[Line], style: WorldStyle, r
         half = 0.5 * road.width_m * style.road_width_factor
         for side in (-1.0, 1.0):
             share = np.clip(style.parked_share + rng.normal(0.0, 0.3), 0.0, 0.95)
-            offset = half + rng.uniform(-1.0, 1.3) if half > 2.4 else half + rng.uniform(0.5, 1.3)
+            offset = half + (rng.uniform(-0.9, 1.6) if half > 3.0 else rng.uniform(0.6, 1.6))
             runs = np.repeat(rng.random(len(points) // 5 + 1) < share, 5)[: len(points)]
             for i in np.flatnonzero(runs & (rng.random(len(points)) < 0.5 + 0.5 * share)):
                 centre = beside(points[i : i + 1], yaw[i : i + 1], side * offset)[0] + rng.normal(0.0, 0.12, 2)

@@ -1,8 +1,9 @@
 """How a simulated world deviates from its map: the random style of a neighbourhood.
 
-A network trained on one tidy style of world does not carry over to real scans, so every world draws its own: how
-hilly it is, how many garden fences, walls and hedges there are and how many of them a map knows, how dense the
-vegetation is, how many cars are parked, and by how much the map is shifted and out of date.
+A share of the worlds is open, with wide verges and little clutter. A network trained on one tidy style of world
+does not carry over to real scans, so every world draws its own: how hilly it is, how many garden fences, walls and
+hedges there are and how many of them a map knows, how dense the vegetation is, how many cars are parked, and by how
+much the map is shifted and out of date.
 """
 
 from __future__ import annotations
@@ -93,15 +94,17 @@ class WorldStyle:
     def random(cls, rng: np.random.Generator) -> WorldStyle:
         """Draw a style; the same generator state gives the same style."""
         shares = rng.dirichlet([1.0, 1.3, 0.8, 1.2])
+        clutter = float(rng.uniform(0.05, 0.4)) if rng.random() < 0.25 else 1.0
+        verge_m = float(rng.uniform(0.0, 8.0)) if clutter < 1.0 else 0.0
         return cls(
             slope=float(abs(rng.normal(0.0, 0.03))),
             hill_amplitude_m=float(rng.gamma(1.2, 0.35)),
-            bank_amplitude_m=float(rng.gamma(1.0, 0.35)),
+            bank_amplitude_m=float(rng.gamma(1.0, 0.45)),
             roughness_m=float(rng.gamma(2.0, 0.03)),
             kerb_m=float(rng.uniform(0.0, 0.15)),
-            road_width_factor=float(rng.uniform(0.85, 1.5)),
-            pavement_m=float(rng.uniform(0.5, 4.0)),
-            plot_share=float(rng.beta(1.8, 0.9)),
+            road_width_factor=float(rng.uniform(0.9, 1.7)),
+            pavement_m=float(rng.uniform(0.8, 4.5)) + verge_m,
+            plot_share=clutter * float(rng.beta(1.2, 0.9)),
             plot_depth_m=float(rng.uniform(8.0, 35.0)),
             wall_share=float(shares[0]),
             hedge_share=float(shares[1]),
@@ -112,15 +115,15 @@ class WorldStyle:
             map_offset_m=0.35,
             building_shift_m=float(rng.uniform(0.05, 0.35)),
             building_turn_deg=float(rng.uniform(0.1, 1.0)),
-            shed_density=float(rng.gamma(1.5, 0.5)),
-            tree_density=float(rng.gamma(1.2, 2.2)),
-            bush_density=float(rng.gamma(1.2, 6.0)),
+            shed_density=clutter * float(rng.gamma(1.5, 0.5)),
+            tree_density=clutter * float(rng.gamma(1.2, 2.2)),
+            bush_density=clutter * float(rng.gamma(1.0, 5.0)),
             forest_spacing_m=float(rng.uniform(3.0, 8.0)),
-            undergrowth=float(rng.beta(1.0, 4.0)),
+            undergrowth=clutter * float(rng.beta(0.7, 5.0)),
             foliage_per_m=float(np.exp(rng.uniform(np.log(0.3), np.log(5.0)))),
-            parked_share=float(rng.beta(1.2, 1.2)),
+            parked_share=clutter * float(rng.beta(0.7, 1.6)),
             car_park_share=float(rng.beta(1.5, 1.5)),
-            traffic_per_km=float(rng.gamma(1.0, 8.0)),
+            traffic_per_km=clutter * float(rng.gamma(1.0, 8.0)),
             poles_per_100m=float(rng.gamma(2.0, 2.5)),
             pedestrians_per_100m=float(rng.gamma(0.7, 1.5)),
             median_share=float(rng.beta(1.0, 1.0)),
