@@ -5,6 +5,7 @@ This package knows nothing of networks, sensors or files, so that any likelihood
 
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
+from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
@@ -28,10 +29,13 @@ __all__ = [
     "ParticleFilterSettings",
     "PoseLikelihood",
     "SkyfixError",
+    "SmootherResult",
+    "SmootherSettings",
     "Trajectory",
     "UniformPrior",
     "UpdateReport",
     "accumulate",
     "find_modes",
     "increments_at",
+    "smooth",
 ]
