@@ -193,7 +193,9 @@ def simulate_scan(
     return points
 
 
-def _ego_shadow(model: LidarModel, azimuths: NDArray[np.float64], elevations: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _ego_shadow(
+    model: LidarModel, azimuths: NDArray[np.floating], elevations: NDArray[np.floating]
+) -> NDArray[np.bool_]:
     """Which (azimuths, beams) the vehicle itself blocks."""
     lowest = np.full(len(azimuths), -np.pi)
     lowest[np.cos(azimuths) > np.cos(np.deg2rad(30.0))] = np.deg2rad(model.front_shadow_deg)

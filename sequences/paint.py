@@ -43,8 +43,12 @@ def fill(raster: Raster, grid: MapGrid, rings: Sequence[NDArray[np.float64]], va
 
 
 def stroke(raster: Raster, grid: MapGrid, xy: NDArray[np.float64], value: float, width_m: float = 0.0) -> None:
-    """Draw a polyline (N, 2); width 0 is a line of one pixel."""
-    thickness = max(1, round(width_m / grid.metres_per_pixel))
+    """Draw a polyline (N, 2); width 0 is a line of one pixel.
+
+    OpenCV's lines are two pixels wider than their thickness, but for thickness 1.
+    """
+    pixels = width_m / grid.metres_per_pixel
+    thickness = 1 if pixels < 2.5 else max(2, round(pixels) - 2)
     cv2.polylines(raster, [fixed_point(grid, xy)], False, float(value), thickness=thickness, shift=SHIFT)
 
 

@@ -23,7 +23,7 @@ from sequences.world_terrain import distance_m, smooth_noise, terrain
 
 _FINEST_M, _COARSEST_M = 0.25, 0.34
 _MAX_CELLS = 32e6
-_CENTRELINE_WIDTH_M = 6.5
+_CENTRELINE_WIDTH_M = 8.5
 _CAR_SPACING_M = 6.5
 
 
