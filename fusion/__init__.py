@@ -6,6 +6,7 @@ This package knows nothing of networks, sensors or files, so that any likelihood
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
+from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
@@ -18,6 +19,7 @@ from fusion.trajectory import Trajectory
 
 __all__ = [
     "Estimate",
+    "GaussianLikelihood",
     "GaussianMixture",
     "LikelihoodVolume",
     "LocationOrientationMaps",

@@ -21,7 +21,8 @@ def wrap(angle: ArrayLike) -> FloatArray:
     """Wrap angles to [-pi, pi); angles already inside are returned bit for bit."""
     angle = np.asarray(angle, dtype=np.float64)
     wrapped = angle - TWO_PI * np.floor((angle + np.pi) / TWO_PI)
-    return np.where((wrapped >= np.pi) | (wrapped < -np.pi), -np.pi, wrapped)  # rounding at the seam
+    wrapped = np.where((wrapped >= np.pi) | (wrapped < -np.pi), -np.pi, wrapped)  # rounding at the seam
+    return np.where((angle >= -np.pi) & (angle < np.pi), angle, wrapped)
 
 
 def _pose(x: FloatArray, y: FloatArray, yaw: FloatArray) -> FloatArray:
