@@ -11,6 +11,7 @@ from fusion.trajectory import Trajectory
 from learned.map_raster import CLASS_INDEX, MapRaster
 from sequences.metrics import drift, summarise
 from sequences.run_result import FrameRow, RunResult, Snapshot
+from sequences.start import prior_answers
 from sequences.track_settings import TrackSettings
 
 SIGMA = np.array([0.30, 0.30, np.deg2rad(0.8)])
@@ -45,6 +46,8 @@ def made_run(frames: int = 120, *, with_truth: bool = True, snapshots: int = 6, 
     single = Trajectory(stamps[matched], truth_poses[matched] + rng.normal(size=(len(matched), 3)) * [2.0, 2.0, 0.05])
     rows = [_row(i, int(stamps[i]), measured=i % 4 == 0, rng=rng) for i in range(frames)]
     methods = {"odometry": odometry, "single_shot": single, "filter": tracked, "smoother": smoothed}
+    settings = TrackSettings(odometry="wheels_emulated")
+    methods["prior"] = prior_answers(truth, settings)
     summaries = {
         method: summarise(truth.interpolate(trajectory.stamp_ns), trajectory.poses, trajectory.covariances)
         for method, trajectory in methods.items()
@@ -54,7 +57,7 @@ def made_run(frames: int = 120, *, with_truth: bool = True, snapshots: int = 6, 
     return RunResult(
         sequence_name=name,
         matcher_name="geometric",
-        settings=TrackSettings(odometry="wheels_emulated"),
+        settings=settings,
         prior=prior,
         stamps_ns=stamps,
         truth=truth if with_truth else None,

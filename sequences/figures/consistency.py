@@ -14,10 +14,10 @@ from sequences.figures.style import (
     FAINT,
     INK,
     METHODS,
+    corner_note,
     legend,
     log_axis,
     new_figure,
-    note,
     plot_method,
     symmetric_limit,
     tidy,
@@ -42,7 +42,7 @@ def covariance_figure(series: RunSeries) -> Figure:
             outside = np.abs(scale * errors.signed[:, row]) > limit
             tidy(axes, title=f"{METHODS[name].label}: {component}", y=f"error ({unit})" if column == 0 else "")
             if outside.any():
-                note(axes, f"{100 * outside.mean():.1f} % of errors beyond the axis", x=0.01, y=0.97, align="left")
+                corner_note(axes, f"{100 * outside.mean():.1f} % of errors beyond the axis")
         panels[row, 0].set_ylim(-limit, limit)
     for axes in panels[-1]:
         axes.set_xlabel("distance travelled (m)", fontsize=9)
@@ -57,18 +57,19 @@ def nees_figure(series: RunSeries) -> Figure:
     low, high = chi2.ppf([0.025, 0.975], DEGREES_OF_FREEDOM)
     along.axhspan(low, high, color="#e3ecf4", zorder=0, label="95 % interval of $\\chi^2_3$")
     along.axhline(DEGREES_OF_FREEDOM, color=FAINT, lw=1.0, ls=":", zorder=1, label="expected, 3")
-    levels.plot([0, 1], [0, 1], color=FAINT, lw=1.0, ls=":", label="calibrated")
+    levels.plot([0, 1], [0, 1], color=FAINT, lw=1.0, ls=":")
     for name, claim in series.claims.items():
         plot_method(along, name, series.errors[name].distance_m, np.maximum(claim.nees, _SMALLEST_SHOWN))
         empirical = np.array([coverage(claim.nees, DEGREES_OF_FREEDOM, float(level)) for level in _LEVELS])
-        plot_method(levels, name, _LEVELS, empirical, label=False)
+        plot_method(levels, name, _LEVELS, empirical)
     log_axis(along)
     tidy(along, title="NEES of (x, y, heading)", x="distance travelled (m)", y="NEES (log)")
     tidy(levels, title="Coverage", x="claimed", y="found")
     for axis in (levels.xaxis, levels.yaxis):
         axis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     levels.set(xlim=(0, 1), ylim=(0, 1.01), aspect="equal")
-    note(levels, "above the line: too cautious\nbelow: too sure", x=0.97, y=0.13, align="right")
+    for x, y, word in ((0.25, 0.85, "too cautious"), (0.75, 0.15, "too sure")):
+        levels.text(x, y, word, ha="center", va="center", fontsize=9, color=FAINT)
     along.set_ylim(_SMALLEST_SHOWN, 5.0 * max(high, *(float(claim.nees.max()) for claim in series.claims.values())))
     legend(along, where="upper right", columns=4)
     return figure

@@ -11,12 +11,14 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sequences.figures.map_drawing import draw_map, extent_of, for_people, scale_bar
 from sequences.figures.series import FloatArray, RunSeries
-from sequences.figures.style import FAINT, INK, METHODS, extent_of, for_people, halo, new_figure
+from sequences.figures.style import FAINT, INK, METHODS, halo, new_figure
 from sequences.run_result import RunResult, Snapshot
 
 _MOST_FRAMES = 6
 _NATS_SHOWN = 10.0
+_LEAST_HALF_M = 6.0
 _CLEAR_TO_PURPLE = LinearSegmentedColormap.from_list(
     "heat", [(1, 1, 1, 0.0), (0.99, 0.75, 0.45, 0.55), (0.85, 0.25, 0.38, 0.8), (0.28, 0.05, 0.42, 0.92)]
 )
@@ -61,12 +63,15 @@ def _draw_bev(axes: Axes, snapshot: Snapshot) -> None:
 
 def _draw_poses(axes: Axes, snapshot: Snapshot) -> None:
     grid = snapshot.map_crop.grid
-    axes.imshow(for_people(snapshot.map_crop), extent=extent_of(grid), interpolation="antialiased")
+    draw_map(axes, snapshot.map_crop)
     length = 0.14 * grid.width_m
     if snapshot.truth is not None:
         _arrow(axes, snapshot.truth, METHODS["truth"].colour, length)
     _arrow(axes, snapshot.best, METHODS["single_shot"].colour, length)
     _arrow(axes, snapshot.estimate, METHODS["filter"].colour, length)
+    left, right, bottom, top = extent_of(grid)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    scale_bar(axes)
 
 
 def _draw_likelihood(axes: Axes, result: RunResult, snapshot: Snapshot) -> None:
@@ -77,14 +82,27 @@ def _draw_likelihood(axes: Axes, result: RunResult, snapshot: Snapshot) -> None:
         grey, extent=extent_of(snapshot.map_crop.grid), cmap="gray", vmin=60, vmax=255, interpolation="antialiased"
     )
     axes.imshow(shown, extent=extent_of(snapshot.heat_grid), cmap=_CLEAR_TO_PURPLE, vmin=0, vmax=1)
-    left, right, bottom, top = extent_of(snapshot.heat_grid)
-    axes.set(xlim=(left, right), ylim=(bottom, top))
     if snapshot.truth is not None:
-        axes.plot(*snapshot.truth[:2], "+", ms=13, mew=1.8, color=METHODS["truth"].colour, path_effects=halo())
-    axes.plot(*snapshot.estimate[:2], "o", ms=4, mec="white", mew=0.7, color=METHODS["filter"].colour)
+        axes.plot(*snapshot.truth[:2], "+", ms=11, mew=1.8, color=METHODS["truth"].colour, path_effects=halo())
+    axes.plot(*snapshot.best[:2], "o", ms=3.5, mec="white", mew=0.7, color=METHODS["single_shot"].colour)
+    axes.plot(*snapshot.estimate[:2], "o", ms=3.5, mec="white", mew=0.7, color=METHODS["filter"].colour)
     at = np.flatnonzero(result.filter.stamp_ns == _stamp_of(result, snapshot))
     if result.filter.covariances is not None and len(at):
         axes.add_patch(covariance_ellipse(snapshot.estimate, result.filter.covariances[at[0], :2, :2]))
+    _zoom(axes, snapshot)
+    scale_bar(axes)
+
+
+def _zoom(axes: Axes, snapshot: Snapshot) -> None:
+    """Show the searched square, or that part of it which holds the poses and the likelihood's mass around them."""
+    left, right, bottom, top = extent_of(snapshot.heat_grid)
+    poses = [snapshot.estimate, snapshot.best, *([] if snapshot.truth is None else [snapshot.truth])]
+    reach = max(float(np.abs(pose[:2] - snapshot.estimate[:2]).max()) for pose in poses)
+    half = max(_LEAST_HALF_M, 1.5 * reach)
+    x, y = (float(value) for value in snapshot.estimate[:2])
+    if half < (right - left) / 2:
+        left, right, bottom, top = x - half, x + half, y - half, y + half
+    axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
 def covariance_ellipse(pose: FloatArray, covariance: FloatArray, level: float = 0.95) -> Ellipse:

@@ -15,12 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import AbstractPathEffect, withStroke
-from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogFormatter
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
-
-from fusion.grid import MapGrid
-from learned.map_raster import CLASSES, MapRaster
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,53 +44,17 @@ INK = "#22262b"
 FAINT = "#8a9199"
 _DOTS_PER_INCH = 130
 
-_CARTOGRAPHY = {
-    "void": "#f1efe9",
-    "building": "#cbbcab",
-    "parking": "#dedbe8",
-    "grass": "#dcebcb",
-    "forest": "#bcd8a6",
-    "water": "#b9d6ea",
-    "road": "#ffffff",
-    "path": "#e6d9c0",
-    "wall": "#857260",
-    "fence": "#a8957f",
-    "hedge": "#8fb676",
-    "tree": "#a3cc86",
-}
-_CLASS_COLOURS: NDArray[np.uint8] = np.array(
-    [[int(_CARTOGRAPHY[name][i : i + 2], 16) for i in (1, 3, 5)] for name in CLASSES], dtype=np.uint8
-)
-
-
-def for_people(raster: MapRaster) -> NDArray[np.uint8]:
-    """Paint a map to draw on: pale cartographic colours where classes are known, else a lightened photograph.
-
-    Returns
-    -------
-    (rows, cols, 3) uint8 RGB, row 0 north.
-    """
-    if raster.classes is not None:
-        return _CLASS_COLOURS[raster.classes]
-    return (255 - (255 - raster.picture.astype(np.float32)) * 0.55).astype(np.uint8)
-
-
-def extent_of(grid: MapGrid) -> tuple[float, float, float, float]:
-    """(left, right, bottom, top) of a grid in metres, as imshow wants it."""
-    return grid.x0, grid.x0 + grid.width_m, grid.y0, grid.y0 + grid.height_m
-
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Make a figure of its own, with its own canvas and a layout that keeps labels apart."""
-    figure = Figure(figsize=(width_in, height_in), dpi=_DOTS_PER_INCH, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
+    """Make a figure with a layout that keeps labels apart."""
+    return Figure(figsize=(width_in, height_in), dpi=_DOTS_PER_INCH, layout="constrained", facecolor="white")
 
 
 def png_bytes(figure: Figure) -> bytes:
     """Render to PNG; the same figure gives the same bytes."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
+    # Straight to the canvas: `savefig` would lay the figure out and draw it twice.
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     return buffer.getvalue()
 
 
@@ -114,38 +74,39 @@ LegendPlace = Literal["best", "upper right", "lower right"]
 
 
 def legend(axes: Axes, *, where: LegendPlace = "best", columns: int = 1) -> None:
-    """Add a legend that covers as little as it can; nothing where nothing is labelled."""
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        axes.legend(handles, labels, loc=where, ncols=columns, fontsize=8, framealpha=0.88, edgecolor="none")
+    """Add a legend that lets the curves under it show through."""
+    axes.legend(loc=where, ncols=columns, fontsize=8, framealpha=0.88, edgecolor="none")
 
 
-def note(axes: Axes, text: str, *, x: float = 0.5, y: float = 0.5, align: str = "center") -> Text:
-    """Write a remark inside axes, in axes coordinates."""
-    vertical = "center" if align == "center" else "top"
+def corner_note(axes: Axes, text: str) -> None:
+    """Write a remark into the upper left corner."""
     box = {"boxstyle": "round,pad=0.3", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-    return axes.text(
-        x, y, text, transform=axes.transAxes, ha=align, va=vertical, fontsize=8, color=INK, bbox=box, zorder=20
-    )
+    axes.text(0.01, 0.97, text, transform=axes.transAxes, va="top", fontsize=8, color=INK, bbox=box, zorder=20)
 
 
-def plot_method(axes: Axes, name: str, x: NDArray[np.float64], y: NDArray[np.float64], *, label: bool = True) -> None:
+def plot_method(axes: Axes, name: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
     """Draw one method in its own style: a line, or dots for single shots (and for a run of one frame)."""
     style = METHODS[name]
-    shown = style.label if label else "_nolegend_"
     if name == "single_shot" or len(x) == 1:
-        axes.plot(x, y, "o", ms=3.2, color=style.colour, alpha=0.75, mew=0, zorder=style.layer, label=shown)
+        axes.plot(x, y, "o", ms=3.2, color=style.colour, alpha=0.75, mew=0, zorder=style.layer, label=style.label)
     else:
-        axes.plot(x, y, ls=style.line, lw=style.width, color=style.colour, zorder=style.layer, label=shown)
+        axes.plot(x, y, ls=style.line, lw=style.width, color=style.colour, zorder=style.layer, label=style.label)
 
 
 def log_axis(axes: Axes) -> None:
     """Make y logarithmic, labelled with plain numbers, with a faint line for every minor tick."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
+    axes.yaxis.set_minor_formatter(FuncFormatter(lambda value, _: _minor_label(axes, value)))
     axes.tick_params(axis="y", which="minor", labelsize=7, colors=INK)
     axes.grid(True, which="minor", axis="y", color="#eceef0", linewidth=0.5)
+
+
+def _minor_label(axes: Axes, value: float) -> str:
+    """Label 0.2, 0.5, 2, 5, ... where the axis spans less than two decades."""
+    low, high = axes.get_ylim()
+    leading = round(value / 10.0 ** np.floor(np.log10(value) + 1e-9))
+    return f"{value:g}" if high / low < 100.0 and leading in (2, 5) else ""
 
 
 def halo(width: float = 3.0) -> list[AbstractPathEffect]:

@@ -5,21 +5,11 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from fusion.prior import UniformPrior
+from sequences.figures.map_drawing import draw_map, draw_prior, north_arrow, scale_bar
 from sequences.figures.series import RunSeries, trajectories_of
-from sequences.figures.style import (
-    INK,
-    METHODS,
-    extent_of,
-    for_people,
-    legend,
-    new_figure,
-    plot_method,
-    tidy,
-)
+from sequences.figures.style import INK, legend, new_figure, plot_method, tidy
 from sequences.run_result import RunResult
 
 FloatArray = NDArray[np.float64]
@@ -34,7 +24,6 @@ def trajectories_figure(result: RunResult, series: RunSeries) -> Figure:
     """Draw the map with every trajectory, the prior's box, a scale bar and two close-ups; north is up."""
     overview = _overview_box(result)
     aspect = (overview[1] - overview[0]) / (overview[3] - overview[2])
-    picture = for_people(result.map)
     if aspect > 1.5:
         figure = new_figure(12.0, 12.0 / aspect + 5.6)
         rows = figure.subplot_mosaic([["all", "all"], ["start", "worst"]], height_ratios=[12.0 / aspect, 5.6])
@@ -47,14 +36,12 @@ def trajectories_figure(result: RunResult, series: RunSeries) -> Figure:
         "worst": _worst_box(result, series),
     }
     for name, (box, title) in panels.items():
-        _draw_panel(rows[name], result, picture, box, title, overview=name == "all")
+        _draw_panel(rows[name], result, box, title, overview=name == "all")
     return figure
 
 
-def _draw_panel(
-    axes: Axes, result: RunResult, picture: NDArray[np.uint8], box: Box, title: str, *, overview: bool
-) -> None:
-    axes.imshow(picture, extent=extent_of(result.map.grid), zorder=0, interpolation="antialiased")
+def _draw_panel(axes: Axes, result: RunResult, box: Box, title: str, *, overview: bool) -> None:
+    draw_map(axes, result.map)
     if result.truth is not None:
         plot_method(axes, "truth", *_xy(result.truth.poses))
     for name, trajectory in trajectories_of(result).items():
@@ -70,63 +57,10 @@ def _draw_panel(
     axes.set_xlim(box[0], box[1])
     axes.set_ylim(box[2], box[3])
     axes.set_aspect("equal")
-    axes.set_facecolor("#f1efe9")
     scale_bar(axes)
     if overview:
         legend(axes)
         north_arrow(axes)
-
-
-def draw_prior(axes: Axes, prior: UniformPrior) -> None:
-    """Outline the box of positions that the run started from."""
-    style, half = METHODS["prior"], prior.half_extent_m
-    corner = (float(prior.centre[0]) - half, float(prior.centre[1]) - half)
-    box = Rectangle(corner, 2 * half, 2 * half, fill=False, ec=style.colour, lw=style.width, label=style.label)
-    box.set_zorder(style.layer)
-    axes.add_patch(box)
-
-
-def scale_bar(axes: Axes) -> None:
-    """Draw a bar of a round length, about a fifth of the width, in the lower left corner."""
-    left, right = axes.get_xlim()
-    bottom, top = axes.get_ylim()
-    length = round_length((right - left) / 5.0)
-    x, y = left + 0.04 * (right - left), bottom + 0.045 * (top - bottom)
-    axes.plot([x, x + length], [y, y], color="white", lw=6.5, solid_capstyle="butt", zorder=13)
-    axes.plot([x, x + length], [y, y], color=INK, lw=3.5, solid_capstyle="butt", zorder=14)
-    axes.annotate(
-        f"{length:g} m",
-        (x + length / 2, y),
-        xytext=(0, 5),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8,
-        color=INK,
-        zorder=14,
-    )
-
-
-def round_length(target_m: float) -> float:
-    """Find the largest of 1, 2 or 5 times a power of ten that is not above `target_m`."""
-    power = 10.0 ** np.floor(np.log10(target_m))
-    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= target_m * (1 + 1e-9)))
-
-
-def north_arrow(axes: Axes) -> None:
-    """Draw an arrow to the top with an N, in the upper left corner."""
-    axes.annotate(
-        "N",
-        xy=(0.035, 0.97),
-        xytext=(0.035, 0.885),
-        xycoords="axes fraction",
-        ha="center",
-        va="center",
-        fontsize=10,
-        fontweight="bold",
-        color=INK,
-        arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.6},
-        zorder=14,
-    )
 
 
 def _xy(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
