@@ -107,14 +107,15 @@ class _Batches(TorchDataset[list[Example]]):
 def batch_nll(
     net: RotMatchNet, examples: list[Example], quadrature: HeadingQuadrature, generator: torch.Generator
 ) -> Tensor:
-    """Mean negative log density of the true poses of a batch, per m^2 rad."""
+    """Mean negative log density of the true poses of a batch, per m^2 rad; the encoders run in bfloat16 while training."""
     density = torch.from_numpy(np.stack([example.density for example in examples]))
     pictures = torch.stack([picture_tensor(example.picture) for example in examples])
-    scans, maps = net.scan_features(density), net.map_features(pictures)
+    with torch.autocast("cpu", torch.bfloat16, enabled=net.training):
+        scans, maps = net.scan_features(density), net.map_features(pictures)
     cell = net.settings.bev.metres_per_pixel * STRIDE
     losses = [
         truth_nll(m, s, (e.row / STRIDE, e.col / STRIDE, e.yaw), cell, quadrature, generator)
-        for m, s, e in zip(maps, scans, examples, strict=True)
+        for m, s, e in zip(maps.float(), scans.float(), examples, strict=True)
     ]
     return torch.stack(losses).mean()
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import FunctionCtx
 
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
@@ -72,9 +73,32 @@ def correlate(map_features: Tensor, templates: Tensor) -> Tensor:
         raise SkyfixError(
             f"voting: expected a template no larger than the map's {(height, width)}, got {tuple(templates.shape[-2:])}"
         )
-    spectrum = torch.fft.rfft2(map_features)
-    product = (torch.fft.rfft2(templates, s=(height, width)).conj() * spectrum).sum(dim=1)
-    return torch.fft.irfft2(product, s=(height, width))[:, :rows, :cols]
+    scores: Tensor = _Correlation.apply(map_features, templates)
+    return scores
+
+
+class _Correlation(torch.autograd.Function):
+    """Correlation by real FFTs, with a backward pass by real FFTs too (autograd's own takes complex ones of full size)."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, map_features: Tensor, templates: Tensor) -> Tensor:
+        height, width = map_features.shape[-2:]
+        map_spectrum = torch.fft.rfft2(map_features)
+        spectra = torch.fft.rfft2(templates, s=(height, width))
+        ctx.save_for_backward(map_spectrum, spectra)
+        ctx.shapes = (height, width), templates.shape[-2:]
+        scores = torch.fft.irfft2((spectra.conj() * map_spectrum).sum(dim=1), s=(height, width))
+        rows, cols = height - templates.shape[-2] + 1, width - templates.shape[-1] + 1
+        return scores[:, :rows, :cols].contiguous()
+
+    @staticmethod
+    def backward(ctx: FunctionCtx, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        map_spectrum, spectra = ctx.saved_tensors
+        size, (rows, cols) = ctx.shapes
+        gradient = torch.fft.rfft2(gradients[0], s=size)[:, None]
+        to_map = torch.fft.irfft2((gradient * spectra).sum(dim=0), s=size)
+        to_templates = torch.fft.irfft2(gradient.conj() * map_spectrum, s=size)
+        return to_map, to_templates[..., :rows, :cols]
 
 
 def vote(map_features: Tensor, scan_features: Tensor, yaws: Tensor, chunk: int = 16) -> Tensor:

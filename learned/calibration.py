@@ -1,0 +1,66 @@
+"""Calibration on held-out data: how far a matcher's likelihoods may be believed.
+
+A network that was trained on other maps, or weights chosen by hand, give scores on a scale of their own. One temperature, fitted by
+maximum likelihood of the true poses (Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, section 4.2), puts them right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from fusion.errors import SkyfixError
+from fusion.likelihood import LikelihoodVolume
+
+_LOG_TEMPERATURE_BOUNDS = (np.log(0.05), np.log(50.0))
+
+
+def mean_nll(
+    volumes: Sequence[LikelihoodVolume], truths: NDArray[np.float64], temperature: float, outliers: float = 0.0
+) -> float:
+    """Mean negative log density, per m^2 rad, of the true poses (N, 3) under volumes at a temperature.
+
+    `outliers` is the weight of the uniform density that a filter mixes in; with it a single wild frame does not decide the fit.
+    """
+    values = [
+        volume.tempered(temperature).with_outliers(outliers).log_density(truth[None])[0]
+        for volume, truth in zip(volumes, truths, strict=True)
+    ]
+    return -float(np.mean(values))
+
+
+def fit_temperature(
+    volumes: Sequence[LikelihoodVolume], truths: NDArray[np.float64], outliers: float = 0.05
+) -> float:
+    """Temperature that makes the true poses most likely.
+
+    Parameters
+    ----------
+    volumes
+        Likelihoods of held-out frames.
+    truths
+        (N, 3) true poses, inside the volumes' crops.
+    outliers
+        Weight of the uniform density mixed in, as in the filter.
+
+    Returns
+    -------
+    The temperature by which to divide the scores of the same matcher, relative to the one it has.
+
+    Raises
+    ------
+    SkyfixError
+        If there are no volumes or the numbers differ.
+    """
+    if len(volumes) == 0 or len(volumes) != len(truths):
+        raise SkyfixError(f"calibration: expected as many volumes as truths, got {len(volumes)} and {len(truths)}")
+    found = minimize_scalar(
+        lambda log_t: mean_nll(volumes, truths, float(np.exp(log_t)), outliers),
+        bounds=_LOG_TEMPERATURE_BOUNDS,
+        method="bounded",
+        options={"xatol": 0.01},
+    )
+    return float(np.exp(found.x))
