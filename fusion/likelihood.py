@@ -138,8 +138,10 @@ class LikelihoodVolume:
         mask = _broadcast_mask(valid, scores.shape)
         cell_volume = grid.metres_per_pixel**2 * se2.TWO_PI / scores.shape[2]
         chosen = scores[mask].astype(np.float64) / temperature
-        if len(chosen) == 0 or not np.isfinite(chosen).all():
-            raise SkyfixError(f"scores: expected finite values at the valid cells, got {len(chosen)} cells with others")
+        if len(chosen) == 0:
+            raise SkyfixError("valid: expected at least one valid cell, got none")
+        if not np.isfinite(chosen).all():
+            raise SkyfixError("scores: expected finite values at the valid cells, got NaN or an infinity")
         chosen -= logsumexp(chosen) + np.log(cell_volume)
         floor = min(DEFAULT_FLOOR, float(chosen.min()) - 1.0)
         log_prob = np.full(scores.shape, floor, dtype=np.float32)
