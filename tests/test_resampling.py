@@ -1,0 +1,85 @@
+"""Resampling: unbiased, exact in number, and safe with the weights that filters really have."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from fusion import SkyfixError
+from fusion.resampling import RESAMPLERS, effective_sample_size, systematic
+
+every_scheme = pytest.mark.parametrize("name", sorted(RESAMPLERS))
+some_weights = arrays(np.float64, st.integers(1, 60), elements=st.floats(0.0, 1e6)).filter(lambda w: w.sum() > 0)
+
+
+@every_scheme
+@given(weights=some_weights, n=st.integers(0, 100), seed=st.integers(0, 1000))
+@settings(max_examples=40)
+def test_indices_are_n_sorted_and_never_of_weight_zero(name, weights, n, seed):
+    chosen = RESAMPLERS[name](weights, n, np.random.default_rng(seed))
+    assert chosen.shape == (n,)
+    assert chosen.dtype == np.int64
+    assert (np.diff(chosen) >= 0).all()
+    assert (weights[chosen] > 0).all()
+
+
+@every_scheme
+def test_copies_are_unbiased(name):
+    weights = np.array([0.35, 0.0, 0.05, 0.211, 0.389])
+    rng, n, rounds = np.random.default_rng(0), 7, 6000
+    counts = np.array([np.bincount(RESAMPLERS[name](weights, n, rng), minlength=5) for _ in range(rounds)])
+    error = np.sqrt(n * weights * (1 - weights) / rounds)  # of the multinomial, the widest of the four
+    assert (np.abs(counts.mean(axis=0) - n * weights) <= 4.5 * error + 1e-12).all()
+
+
+def test_schemes_differ_in_variance_as_theory_says():
+    weights = np.random.default_rng(1).dirichlet(np.ones(30))
+    rng = np.random.default_rng(2)
+    spread = {
+        name: np.var([np.bincount(scheme(weights, 30, rng), minlength=30) for _ in range(2000)], axis=0).sum()
+        for name, scheme in RESAMPLERS.items()
+    }
+    assert spread["systematic"] < spread["multinomial"]
+    assert spread["stratified"] < 0.8 * spread["multinomial"]
+    assert spread["residual"] < 0.8 * spread["multinomial"]
+
+
+@given(some_weights, st.integers(1, 100), st.integers(0, 100))
+def test_systematic_gives_every_particle_its_share_rounded(weights, n, seed):
+    counts = np.bincount(systematic(weights, n, np.random.default_rng(seed)), minlength=len(weights))
+    share = n * weights / weights.sum()
+    assert (counts >= np.floor(share - 1e-6)).all()
+    assert (counts <= np.ceil(share + 1e-6)).all()
+
+
+@every_scheme
+def test_weights_that_sum_to_slightly_less_or_more_than_one(name):
+    weights = np.full(100_000, 1e-5) * (1 - 1e-9)
+    chosen = RESAMPLERS[name](weights, 100_000, np.random.default_rng(3))
+    assert chosen.max() <= 99_999
+    assert len(RESAMPLERS[name](weights * 1.001, 10, np.random.default_rng(3))) == 10
+
+
+@every_scheme
+@pytest.mark.parametrize("weights", [[0.0, 0.0], [], [0.5, np.nan], [0.5, -0.1], [np.inf, 1.0]])
+def test_weights_without_meaning_are_refused_instead_of_becoming_nan(name, weights):
+    with pytest.raises(SkyfixError, match="weights"):
+        RESAMPLERS[name](np.array(weights), 5, np.random.default_rng(0))
+
+
+@every_scheme
+def test_same_seed_same_indices(name):
+    weights = np.random.default_rng(4).random(50)
+    first, second = (RESAMPLERS[name](weights, 50, np.random.default_rng(9)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+@given(st.integers(1, 1000), st.floats(-2000.0, 2000.0))
+def test_effective_sample_size_of_equal_weights_is_their_number(n, shift):
+    assert effective_sample_size(np.full(n, shift)) == pytest.approx(n)
+
+
+def test_effective_sample_size_of_one_heavy_particle_is_one():
+    assert effective_sample_size([0.0, -1000.0, -2000.0]) == pytest.approx(1.0)
+    assert effective_sample_size(np.log([0.5, 0.25, 0.25])) == pytest.approx(1.0 / (0.25 + 0.0625 + 0.0625))
