@@ -9,7 +9,7 @@ fits in memory (13 bytes a cell).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import cv2
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.grid import MapGrid
+from sequences import paint
 
 DENSITY_STEP_PER_M = 0.05
 HEIGHT_STEP_M = 0.1
@@ -84,3 +85,14 @@ class World:
         blocked = cv2.dilate(tall.astype(np.uint8), kernel)
         free: NDArray[np.bool_] = (blocked[self.cells(xy)] == 0) & self.grid.contains(xy)
         return free
+
+    def cleared(self, path_xy: NDArray[np.float64], width_m: float) -> World:
+        """The world with everything but buildings taken away along a path (N, 2), so that a vehicle can drive
+        there."""
+        lane = np.zeros(self.ground.shape, dtype=np.uint8)
+        paint.stroke(lane, self.grid, path_xy, 1, width_m)
+        clear = (lane > 0) & (self.material != Material.BUILDING)
+        surface, top = self.surface.copy(), self.canopy_top.copy()
+        surface[clear] = self.ground[clear]
+        top[clear & (self.canopy_bottom < round(3.0 / HEIGHT_STEP_M))] = 0
+        return replace(self, surface=surface, canopy_top=top)
