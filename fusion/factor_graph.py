@@ -24,7 +24,7 @@ from fusion.odometry import OdometryIncrement
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory, checked_stamps
 
-_LEAST_VARIANCE = 1e-12
+_LEAST_VARIANCE = 1e-15
 _UNKNOWN_START = np.diag([9.0, 9.0, np.deg2rad(10.0) ** 2])  # of start values that come without covariances
 
 
