@@ -98,7 +98,7 @@ class LidarModel:
         else:
             elevations = np.linspace(rng.uniform(2.0, 15.0), rng.uniform(-25.0, -15.0), int(rng.integers(32, 129)))
         return cls(
-            tuple(float(e) for e in elevations + rng.uniform(0.0, 0.6) + rng.normal(0.0, 0.03, len(elevations))),
+            tuple(float(e) for e in elevations + rng.uniform(0.0, 1.2) + rng.normal(0.0, 0.03, len(elevations))),
             azimuths,
             min_range_m=float(rng.uniform(1.3, 3.0)),
             max_range_m=float(rng.uniform(70.0, 100.0)),

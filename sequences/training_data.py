@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from learned.bev import BevSettings, bev_counts
-from learned.samples import Sample, cut_sample
+from learned.samples import SAMPLE_METRES_PER_PIXEL, Sample, cut_sample
 from sequences.lidar import LidarModel, simulate_scan
 from sequences.osm import MapFeatures
 from sequences.world import World, build_area, sample_road_poses
@@ -25,7 +25,6 @@ from sequences.world_style import WorldStyle
 
 _ATTEMPTS = 60
 _AREAS_MIXED = 16
-_MAP_METRES_PER_PIXEL = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +139,7 @@ class SimulatedSamples:
                 continue
             world, map_raster = build_area(features, grid, WorldStyle.random(rng), rng)
             margin = settings.area_half_extent_m - settings.scan_half_extent_m
-            poses = sample_road_poses(features, world, settings.samples_per_area, rng, margin_m=margin)
+            poses = sample_road_poses(world, settings.samples_per_area, rng, margin_m=margin)
             if len(poses) < settings.samples_per_area or map_raster.classes is None:
                 continue
             azimuths = int(rng.integers(settings.azimuths[0], settings.azimuths[1] + 1))
@@ -171,6 +170,6 @@ def _neighbourhood(features: MapFeatures, half_extent_m: float, rng: np.random.G
     lengths = np.array([np.hypot(*np.diff(road.points, axis=0).T).sum() for road in roads])
     road = roads[int(rng.choice(len(roads), p=lengths / lengths.sum()))]
     centre = road.points[int(rng.integers(len(road.points)))]
-    size = 2 * round(half_extent_m / _MAP_METRES_PER_PIXEL)
+    size = 2 * round(half_extent_m / SAMPLE_METRES_PER_PIXEL)
     x0, y0 = centre - half_extent_m
-    return MapGrid(size, size, _MAP_METRES_PER_PIXEL, float(x0), float(y0))
+    return MapGrid(size, size, SAMPLE_METRES_PER_PIXEL, float(x0), float(y0))

@@ -23,6 +23,7 @@ from sequences.world_model import Material, World
 from sequences.world_raster import world_from_raster
 from sequences.world_style import WorldStyle
 from sequences.world_terrain import smooth_noise, terrain
+from sequences.world_variants import rebuilt
 
 __all__ = ["Material", "World", "WorldStyle", "build_area", "sample_road_poses", "world_from_raster"]
 
@@ -51,7 +52,7 @@ def build_area(
     metres_per_pixel
         Resolution of the world.
     """
-    here = features.within(grid, 15.0)
+    here = rebuilt(features.within(grid, 15.0), style, rng)
     layers = WorldLayers(_finer(grid, metres_per_pixel))
     offset = rng.normal(0.0, style.map_offset_m, 2)
     lines = _moved_lines(here.lines, offset, style, rng)
@@ -80,35 +81,35 @@ def build_area(
     _vegetate(layers, here, lines, room, style, rng)
     world_roads.populate(layers, here, lines, style, rng)
 
-    texture = np.exp(np.float32(0.35) * smooth_noise(layers.grid, 0.8, rng))
-    world = layers.finish(ground, room, texture)
+    texture = np.exp(np.float32(0.5) * smooth_noise(layers.grid, 0.8, rng))
+    world = replace(layers.finish(ground, room, texture), roads=tuple(_roads(lines)))
     known += [small for small in sheds if rng.random() < 0.4]
     drawn = (*here.lines, *(part for line in extra for part in world_plots.standing_parts(line, room, layers.grid)))
     return world, rasterise(MapFeatures(tuple(known), drawn), grid)
 
 
 def sample_road_poses(
-    features: MapFeatures, world: World, number: int, rng: np.random.Generator, margin_m: float = 0.0
+    world: World, number: int, rng: np.random.Generator, margin_m: float = 0.0
 ) -> NDArray[np.float64]:
-    """Up to `number` poses (N, 3) of a vehicle driving on roads, where the world leaves room for it.
+    """Up to `number` poses (N, 3) of a vehicle driving on the world's roads, where nothing is in its way.
 
-    Poses lie in a lane with some lateral scatter, headings along the road with some turned by a few degrees;
-    `margin_m` keeps them away from the border of the world. Fewer come back where the area has little road.
+    Poses lie in a lane with some lateral scatter, headings along it with some degrees of scatter; `margin_m` keeps them
+    away from the border of the world. Fewer come back where the area has little road.
     """
-    inner = world.grid
+    grid = world.grid
     candidates = []
-    for line in _roads(features.within(inner).lines):
-        points, yaw = world_roads.resampled(line.points, 2.0)
-        turned = np.where((rng.random(len(points)) < 0.5) & (not line.one_way), np.pi, 0.0)
-        lane = -rng.uniform(0.0, 0.35, len(points)) * line.width_m
-        heading = yaw + turned
-        spots = points + lane[:, None] * np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+    for road in world.roads:
+        points, yaw = world_roads.resampled(road.points, 2.0)
+        against = (rng.random(len(points)) < 0.5) & (not road.one_way)
+        heading = yaw + np.where(against, np.pi, 0.0)
+        left = -rng.uniform(-0.2 if road.one_way else 0.0, 0.35, len(points)) * road.width_m
+        spots = points + left[:, None] * np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
         candidates.append(np.column_stack([spots, heading + rng.normal(0.0, 0.06, len(points))]))
     if not candidates:
         return np.zeros((0, 3))
     poses = np.concatenate(candidates)
-    low = np.array([inner.x0 + margin_m, inner.y0 + margin_m])
-    high = np.array([inner.x0 + inner.width_m - margin_m, inner.y0 + inner.height_m - margin_m])
+    low = np.array([grid.x0, grid.y0]) + margin_m
+    high = np.array([grid.x0 + grid.width_m, grid.y0 + grid.height_m]) - margin_m
     inside = np.all((poses[:, :2] > low) & (poses[:, :2] < high), axis=1)
     poses = poses[inside & world.is_free(poses[:, :2], 1.6)]
     chosen: NDArray[np.float64] = poses[rng.permutation(len(poses))[:number]]

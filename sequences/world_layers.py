@@ -111,7 +111,7 @@ class WorldLayers:
         boundary_room
             (rows, cols) where garden boundaries may stand.
         texture
-            (rows, cols) factor about 1 on the height and density of porous things, so that foliage is not smooth.
+            (rows, cols) factor about 1 on the height of porous things, squared on their density: foliage is not smooth.
         """
         surface = ground.copy()
         material = self.base
@@ -123,9 +123,9 @@ class WorldLayers:
                 brush = self.brush_m > 0.05
                 bottom[brush] = 0
                 top[brush] = np.clip(self.brush_m[brush] / HEIGHT_STEP_M, 1, 255).astype(np.uint8)
-                density[brush] = np.clip(self.brush_density_per_m * texture[brush] / DENSITY_STEP_PER_M, 1, 255).astype(
-                    np.uint8
-                )
+                density[brush] = np.clip(
+                    self.brush_density_per_m * texture[brush] ** 2 / DENSITY_STEP_PER_M, 1, 255
+                ).astype(np.uint8)
                 mask &= boundary_room
             where = np.flatnonzero(mask)
             rows = layer.table()[layer.numbers.ravel()[where]]
@@ -137,7 +137,7 @@ class WorldLayers:
             factor = np.where(rows[:, 3] == float(Material.FOLIAGE), texture.ravel()[cells], np.float32(1.0))
             bottom.ravel()[cells] = np.clip(rows[:, 0] / HEIGHT_STEP_M, 0, 255).astype(np.uint8)
             top.ravel()[cells] = np.clip(rows[:, 1] * factor / HEIGHT_STEP_M, 0, 255).astype(np.uint8)
-            density.ravel()[cells] = np.clip(rows[:, 2] * factor / DENSITY_STEP_PER_M, 1, 255).astype(np.uint8)
+            density.ravel()[cells] = np.clip(rows[:, 2] * factor**2 / DENSITY_STEP_PER_M, 1, 255).astype(np.uint8)
         where = np.flatnonzero(self.solid.numbers)
         rows = self.solid.table()[self.solid.numbers.ravel()[where]]
         surface.ravel()[where] = ground.ravel()[where] + rows[:, 1]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from fusion.grid import MapGrid
 from sequences import paint
+from sequences.osm import Line
 
 DENSITY_STEP_PER_M = 0.05
 HEIGHT_STEP_M = 0.1
@@ -56,6 +57,8 @@ class World:
         uint8, chance of a return per metre of path, in steps of `DENSITY_STEP_PER_M`.
     material
         uint8, `Material` of the solid or bare surface.
+    roads
+        Where the carriageways are; none for a world made from a raster.
     """
 
     grid: MapGrid
@@ -65,6 +68,7 @@ class World:
     canopy_top: NDArray[np.uint8]
     canopy_density: NDArray[np.uint8]
     material: NDArray[np.uint8]
+    roads: tuple[Line, ...] = ()
 
     def cells(self, xy: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Row and column of the cells that hold map points (..., 2), clamped to the grid."""

@@ -34,7 +34,7 @@ def add_bush(layers: WorldLayers, xy: NDArray[np.float64], style: WorldStyle, rn
     """Stamp a bush of 0.3 to 3 m."""
     top = rng.uniform(0.3, 1.5) * rng.uniform(1.0, 2.0)
     radius = rng.uniform(0.3, 0.3 + 0.6 * top)
-    layers.low.disc(xy, radius, top, Material.FOLIAGE, 0.0, style.foliage_per_m * rng.uniform(0.7, 3.0))
+    layers.low.disc(xy, radius, top, Material.FOLIAGE, 0.0, style.foliage_per_m * rng.uniform(0.4, 2.0))
 
 
 def add_tree_row(layers: WorldLayers, line: Line, offset_m: float, style: WorldStyle, rng: np.random.Generator) -> None:

@@ -61,7 +61,7 @@ def world_from_raster(map_raster: MapRaster, seed: int, style: WorldStyle | None
     _vegetate(layers, classes, room, style, rng)
     _barriers(layers, classes, style, rng)
     _park_cars(layers, off_road, style, rng)
-    texture = np.exp(np.float32(0.35) * smooth_noise(grid, 0.8, rng))
+    texture = np.exp(np.float32(0.5) * smooth_noise(grid, 0.8, rng))
     world = layers.finish(ground, room, texture)
     _extrude(world, building, style, rng)
     return world

@@ -51,6 +51,9 @@ class WorldStyle:
         Street furniture and people along roads.
     median_share
         Share of wide roads with a median strip or guard rail.
+    divided_share, mapped_strip_share, mapped_pavement_share
+        Share of larger roads that are divided by a median, and of road sides with a verge or parking strip and with a
+        pavement that the map draws.
     extrusion_share
         Share of facades with balconies, porches and bays.
     storeys
@@ -87,6 +90,9 @@ class WorldStyle:
     poles_per_100m: float = 5.0
     pedestrians_per_100m: float = 1.0
     median_share: float = 0.5
+    divided_share: float = 0.0
+    mapped_strip_share: float = 0.0
+    mapped_pavement_share: float = 0.0
     extrusion_share: float = 0.4
     storeys: float = 2.5
 
@@ -127,6 +133,9 @@ class WorldStyle:
             poles_per_100m=float(rng.gamma(2.0, 2.5)),
             pedestrians_per_100m=float(rng.gamma(0.7, 1.5)),
             median_share=float(rng.beta(1.0, 1.0)),
+            divided_share=float(rng.uniform(0.3, 1.0)) if rng.random() < 0.25 else 0.0,
+            mapped_strip_share=float(rng.beta(0.5, 1.5)),
+            mapped_pavement_share=float(rng.beta(0.4, 1.0)),
             extrusion_share=float(rng.beta(1.0, 1.3)),
             storeys=float(rng.uniform(1.5, 5.0)),
         )

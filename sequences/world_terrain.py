@@ -10,7 +10,7 @@ from fusion.grid import MapGrid
 from sequences.world_style import WorldStyle
 
 _CROWN_SLOPE = 0.02
-_BANK_START_M, _BANK_END_M = 1.5, 9.0
+_BANK_START_M = 0.8
 
 
 def smooth_noise(grid: MapGrid, wavelength_m: float, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -46,7 +46,8 @@ def terrain(
     grade_x, grade_y = style.slope * np.cos(towards), style.slope * np.sin(towards)
     ground = ((x - x.mean()) * grade_x)[None, :] + ((y - y.mean()) * grade_y)[:, None]
     height = ground.astype(np.float32) + np.float32(style.hill_amplitude_m) * smooth_noise(grid, 90.0, rng)
-    bank = np.clip((off_road - _BANK_START_M) / (_BANK_END_M - _BANK_START_M), 0.0, 1.0, dtype=np.float32)
+    bank_width_m = rng.uniform(2.0, 8.0)
+    bank = np.clip((off_road - _BANK_START_M) / bank_width_m, 0.0, 1.0, dtype=np.float32)
     bank *= bank * (np.float32(3.0) - np.float32(2.0) * bank)
     height += np.float32(style.bank_amplitude_m) * bank * (smooth_noise(grid, 45.0, rng) + np.float32(0.5))
     rough = np.clip(off_road / 3.0, 0.0, 1.0, dtype=np.float32)

@@ -144,7 +144,7 @@ def test_free_space_keeps_its_distance() -> None:
 def test_road_poses_lie_on_roads_and_along_them() -> None:
     rng = np.random.default_rng(0)
     world, _ = build_area(TOWN, GRID, WorldStyle(), rng)
-    poses = sample_road_poses(TOWN, world, 30, rng, margin_m=20.0)
+    poses = sample_road_poses(world, 30, rng, margin_m=20.0)
     assert 0 < len(poses) <= 30
     assert np.abs(poses[:, :2]).max() <= 40.0
     assert (np.abs(poses[:, :2]).min(axis=1) < 3.5).all()
@@ -156,7 +156,7 @@ def test_road_poses_lie_on_roads_and_along_them() -> None:
 def test_road_poses_of_a_place_without_roads_are_none() -> None:
     rng = np.random.default_rng(0)
     world, _ = build_area(MapFeatures(TOWN.areas, ()), GRID, BARE, rng)
-    assert sample_road_poses(MapFeatures(TOWN.areas, ()), world, 5, rng).shape == (0, 3)
+    assert sample_road_poses(world, 5, rng).shape == (0, 3)
 
 
 def raster_town(road_width: int) -> MapRaster:
