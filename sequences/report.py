@@ -139,4 +139,5 @@ def _render(result: RunResult, series: RunSeries, pictures: list[Picture]) -> st
         pictures=pictures,
         stages=stage_rows(result),
         settings=settings_rows(result),
+        log=result.log,
     )

@@ -127,7 +127,7 @@ def stage_rows(result: RunResult) -> list[StageRow]:
     total = sum(sum(times) for times in by_stage.values())
     rows = [
         StageRow(
-            name=stage,
+            name="scan (simulated)" if stage == "scan" and result.scans_simulated else stage,
             mean_ms=float(np.mean(times)),
             p95_ms=float(np.percentile(times, 95)),
             frames=len(times),

@@ -76,7 +76,7 @@ def made_run(frames: int = 120, *, with_truth: bool = True, snapshots: int = 6, 
         scans_simulated=True,
         odometry_source="wheels_emulated",
         length_m=truth.length_m,
-        log=[],
+        log=["frame 9 (4.5 s): not measured: scan 8: expected points, got none", "<i>second line</i>"],
     )
 
 

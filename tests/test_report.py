@@ -71,7 +71,7 @@ def page(run_folder: Path) -> Page:
 
 def test_page_has_every_section_in_order(page: Page) -> None:
     pictures = ["trajectories", "error", "covariance", "nees", "frames", "health"]
-    assert page.sections == ["provenance", "methods", *pictures, "timing", "settings"]
+    assert page.sections == ["provenance", "methods", *pictures, "timing", "log", "settings"]
     assert page.open == []
 
 
@@ -93,7 +93,7 @@ def test_pictures_beside_the_page_are_those_in_it(name: str, page: Page, run_fol
         value.partition(",")[2] for tag, attribute, value in page.attributes if (tag, attribute) == ("img", "src")
     ]
     assert base64.b64encode(png).decode() in embedded
-    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    picture = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
     height, width = picture.shape[:2]
     assert 800 <= width <= 2000
     assert 400 <= height <= 2000
@@ -106,6 +106,7 @@ def test_pictures_beside_the_page_are_those_in_it(name: str, page: Page, run_fol
 def test_text_from_outside_is_escaped(page: Page, run_folder: Path) -> None:
     assert "<b>drive</b>" not in (run_folder / "report.html").read_text(encoding="utf-8")
     assert NAME in page.text
+    assert "<i>second line</i>" in page.text
 
 
 def test_page_gives_the_metrics(page: Page) -> None:

@@ -21,7 +21,7 @@ def health_figure(result: RunResult, series: RunSeries) -> Figure:
     distance_m = _distance(series, rows)
     particles = result.settings.particles
     share = [row.effective_sample_size / particles for row in rows]
-    size.plot(distance_m, share, ".-", ms=2.5, lw=0.9, color=colour)
+    size.plot(distance_m, share, ".-", ms=1.5, lw=0.7, color=colour)
     size.set_ylim(0.0, 1.05)
     tidy(size, title=f"Effective sample size, share of {particles:,} particles", y="share")
 
@@ -29,7 +29,7 @@ def health_figure(result: RunResult, series: RunSeries) -> Figure:
     evidence.plot(_distance(series, measured), [row.log_evidence for row in measured], ".", ms=4, color=colour)
     tidy(evidence, title="Evidence: density that each measurement gave to the prediction", y="ln (1 / m² rad)")
 
-    lost.plot(distance_m, [row.lost_score for row in rows], ".-", ms=2.5, lw=1.1, color=METHODS["odometry"].colour)
+    lost.plot(distance_m, [row.lost_score for row in rows], ".-", ms=1.5, lw=1.1, color=METHODS["odometry"].colour)
     lost.set_ylim(-0.04, 1.05)
     threshold = result.settings.lost_threshold
     lost.axhline(threshold, color=INK, lw=0.8, ls=":")

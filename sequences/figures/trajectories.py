@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sequences.figures.map_drawing import draw_map, draw_prior, north_arrow, scale_bar
 from sequences.figures.series import RunSeries, trajectories_of
-from sequences.figures.style import INK, legend, new_figure, plot_method, tidy
+from sequences.figures.style import INK, halo, legend, new_figure, plot_method, tidy
 from sequences.run_result import RunResult
 
 FloatArray = NDArray[np.float64]
@@ -51,7 +51,9 @@ def _draw_panel(axes: Axes, result: RunResult, box: Box, title: str, *, overview
     for pose, marker, word in ((path[-1], "s", "end"), (path[0], "o", "start")):
         axes.plot(*pose[:2], marker, ms=7, mfc="white", mec=INK, mew=1.4, zorder=12)
         if overview:
-            axes.annotate(word, pose[:2], xytext=(8, 6), textcoords="offset points", fontsize=9, color=INK, zorder=12)
+            axes.annotate(
+                word, pose[:2], xytext=(8, 6), textcoords="offset points", color=INK, zorder=12, path_effects=halo()
+            )
     tidy(axes, title=title, x="x, east (m)", y="y, north (m)")
     axes.grid(False)
     axes.set_xlim(box[0], box[1])
