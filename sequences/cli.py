@@ -164,18 +164,24 @@ def evaluate(
             raise SkyfixError(f"{json_file}: cannot be written: {error.strerror}") from error
 
 
-@app.command(epilog="Example: `skyfix train rotmatch.yaml`")
-def train(config: Annotated[Path, typer.Argument(help="YAML file with the training's settings.")]) -> None:
-    """Train a matcher on scans simulated in OpenStreetMap extracts."""
-    from learned.training import train_from_config
+@app.command(epilog="Example: `skyfix train rotmatch.yaml --data osm --out runs/training`")
+def train(
+    config: Annotated[Path, typer.Argument(help="YAML file with the training's settings.")],
+    data: Annotated[Path, typer.Option(help="Folder of the OpenStreetMap extracts.", metavar="DIR")] = Path(),
+    out: Annotated[Path, typer.Option(help="Gets the checkpoint, the loss curve and the cache.", metavar="DIR")] = Path(
+        "runs/training"
+    ),
+) -> None:
+    """Train a matcher on scans simulated in OpenStreetMap extracts; goes on where it was stopped."""
+    from sequences.train_command import train_from_config
 
-    train_from_config(config)
+    typer.echo(f"checkpoint: {train_from_config(config, data, out, _training_line)}")
 
 
 @app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")
 def view(run: Annotated[Path, typer.Argument(help="Run directory.")]) -> None:
     """Print the table of a run again, and where its report is."""
-    from sequences.run_directory import read_metrics
+    from sequences.run_files import read_metrics
 
     _show(read_metrics(run), run / "report.html")
 
@@ -208,7 +214,8 @@ def _run(
     from learned.matcher import load_matcher
     from sequences.localize import track as track_drive
     from sequences.progress import ConsoleProgress
-    from sequences.run_directory import check_target, write_run
+    from sequences.run_directory import write_run
+    from sequences.run_files import check_target
 
     out = out or Path("runs") / f"{sequence.name}-{settings.odometry}-seed{settings.seed}"
     check_target(out, overwrite)
@@ -219,13 +226,22 @@ def _run(
 
 
 def _show(metrics: dict[str, object], report: Path) -> None:
-    from sequences.tables import closing_lines, run_table
+    from sequences.tables import closing_lines, run_table, run_title
 
     console = Console(highlight=False)
-    console.print(run_table(metrics))
+    if "filter" in metrics:
+        console.print(run_table(metrics))
+    else:
+        console.print(run_title(metrics), soft_wrap=True)
     for line in closing_lines(metrics):
         console.print(line, soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
+
+
+def _training_line(step: int, steps: int, loss: float, validation: float | None) -> None:
+    if step % 50 == 0 or step == steps:
+        held_out = "" if validation is None else f", validation {validation:.3f}"
+        print(f"step {step}/{steps}: loss {loss:.3f}{held_out}", file=sys.stderr)
 
 
 def main() -> None:

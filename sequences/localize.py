@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
-from fusion.factor_graph import smooth
 
+from fusion.factor_graph import SmootherSettings, smooth
 from fusion.odometry import increments_at
 from fusion.trajectory import Trajectory
 from learned.matcher import MapMatcher
@@ -80,7 +80,8 @@ def track(
         "map",
     )
     begin = time.perf_counter()
-    smoothed = smooth(drive.stamps_ns, increments, online.modes, prior, filtered)
+    smoother_settings = SmootherSettings(outlier_probability=settings.outlier_probability)
+    smoothed = smooth(drive.stamps_ns, increments, online.modes, prior, filtered, smoother_settings)
     smoothing_s = time.perf_counter() - begin
     measured = sorted(online.best)
     result = RunResult(
@@ -94,8 +95,8 @@ def track(
         single_shot=Trajectory(
             drive.stamps_ns[measured], np.array([online.best[frame] for frame in measured]), None, "map"
         ),
-        filter=filtered,
-        smoother=smoothed.trajectory,
+        filter=_with_map_error(filtered, settings.map_error_m),
+        smoother=_with_map_error(smoothed.trajectory, settings.map_error_m),
         frame_rows=online.rows,
         snapshots=online.snapshots,
         metrics={},
@@ -106,6 +107,14 @@ def track(
         log=[*_described(drive), *online.log],
     )
     return replace(result, metrics=run_metrics(result, smoothing_s))
+
+
+def _with_map_error(estimate: Trajectory, sigma_m: float) -> Trajectory:
+    """Claim no more than the map can give: its own error does not average out, so it is added to every covariance."""
+    if estimate.covariances is None:
+        return estimate
+    covariances = estimate.covariances + np.diag([sigma_m**2, sigma_m**2, 0.0])
+    return replace(estimate, covariances=covariances)
 
 
 def _error(drive: Drive, online: FilterPass, frame: int) -> float | None:

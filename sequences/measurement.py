@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from fusion import se2
 from fusion.arrays import Float32Array, FloatArray
 from fusion.likelihood import LikelihoodVolume
 from fusion.modes import GaussianMixture
 from learned.matcher import SearchRegion
+
+_NEIGHBOURS = np.array([-1, 0, 1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +41,14 @@ class Measurement:
         return self.likelihood.tempered(self.temperature).modes(k)
 
     def best_pose(self) -> FloatArray:
-        """The matcher's own answer (3,): the mean of the mass around its strongest mode, an argmax refined below the
-        cell."""
-        return self.likelihood.modes(1).means[0].copy()
+        """The matcher's own answer (3,): the highest cell, refined below the cell by the mean over its neighbours."""
+        volume = self.likelihood
+        rows, cols, bins = volume.log_prob.shape
+        row, col, yaw_bin = np.unravel_index(int(np.argmax(volume.log_prob)), volume.log_prob.shape)
+        near_rows = np.clip(row + _NEIGHBOURS, 0, rows - 1)
+        near_cols = np.clip(col + _NEIGHBOURS, 0, cols - 1)
+        near_bins = yaw_bin + _NEIGHBOURS
+        mass = np.exp(volume.log_prob[np.ix_(near_rows, near_cols, near_bins % bins)] - volume.log_prob.max())
+        grid_rows, grid_cols, grid_bins = np.meshgrid(near_rows + 0.5, near_cols + 0.5, near_bins, indexing="ij")
+        centre = [float(np.average(values, weights=mass)) for values in (grid_rows, grid_cols, grid_bins)]
+        return np.array([*volume.grid.xy_from_pixel(centre[:2]), se2.wrap(centre[2] * se2.TWO_PI / bins)])

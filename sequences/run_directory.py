@@ -26,32 +26,9 @@ from fusion.trajectory import Trajectory
 from sequences.filter_pass import STAGES
 from sequences.metrics import position_errors, vehicle_frame_errors
 from sequences.report import write_report
+from sequences.run_files import CONFIG_FILE, METRICS_FILE, check_target
 from sequences.run_result import FrameRow, RunResult
 from sequences.trajectory_io import format_seconds, write_tum
-
-METRICS_FILE = "metrics.json"
-CONFIG_FILE = "config.yaml"
-
-
-def check_target(out_dir: Path, overwrite: bool) -> None:
-    """Refuse a target that `write_run` would refuse, before any time is spent.
-
-    Raises
-    ------
-    SkyfixError
-        If it exists and is not an empty folder, unless it is a run directory and `overwrite` is set.
-    """
-    if not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir())):
-        return
-    if not is_run_directory(out_dir):
-        raise SkyfixError(f"{out_dir}: exists and is not a run directory; choose another --out")
-    if not overwrite:
-        raise SkyfixError(f"{out_dir}: holds a run already; give --overwrite to replace it, or another --out")
-
-
-def is_run_directory(path: Path) -> bool:
-    """Whether a folder looks like one that `write_run` wrote."""
-    return (path / METRICS_FILE).is_file() and (path / CONFIG_FILE).is_file()
 
 
 def write_run(result: RunResult, out_dir: Path, overwrite: bool = False) -> Path:
@@ -90,17 +67,6 @@ def write_run(result: RunResult, out_dir: Path, overwrite: bool = False) -> Path
     finally:
         shutil.rmtree(draft, ignore_errors=True)
     return out_dir / "report.html"
-
-
-def read_metrics(run_dir: Path) -> dict[str, Any]:
-    """The content of a run's `metrics.json`; `SkyfixError` when `run_dir` is not a run directory."""
-    if not is_run_directory(run_dir):
-        raise SkyfixError(f"{run_dir}: expected a run directory ({METRICS_FILE}, {CONFIG_FILE}), found none")
-    try:
-        metrics: dict[str, Any] = json.loads((run_dir / METRICS_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SkyfixError(f"{run_dir / METRICS_FILE}: cannot be read: {error}") from error
-    return metrics
 
 
 def _put_in_place(draft: Path, out_dir: Path) -> None:

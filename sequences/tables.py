@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 ROWS = {
@@ -16,10 +17,12 @@ ROWS = {
 """metrics.json's methods, in the order shown, and what a person calls them."""
 ERROR_COLUMNS = (
     *("mean m", "median m", "rmse m", "max m"),
-    *("heading mean °", "median °"),
+    *("heading mean °", "heading median °"),
     *("lateral @1 m", "longitudinal @1 m", "heading @1°"),
 )
 """Headers of `error_cells`. @1: the share of frames with an error below 1."""
+
+_SHORT = {"longitudinal": "long.", "lateral": "lat.", "heading": "head.", "median": "med."}
 
 
 def error_cells(summary: dict[str, Any]) -> list[str]:
@@ -34,15 +37,23 @@ def error_cells(summary: dict[str, Any]) -> list[str]:
 
 def run_table(metrics: dict[str, Any]) -> Table:
     """The methods of a run beside each other; without ground truth, a table with no lines."""
-    table = Table(title=run_title(metrics), title_justify="left")
-    table.add_column("method")
-    for column in (*ERROR_COLUMNS, "95 % ellipse"):
-        table.add_column(column, justify="right")
+    table = Table(title=run_title(metrics), title_justify="left", box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    table.add_column("method", no_wrap=True)
+    for column in (*map(_stacked, ERROR_COLUMNS), "95 %\nellipse"):
+        table.add_column(column, justify="right", no_wrap=True)
     for key, label in ROWS.items():
         if key in metrics:
             ellipse = metrics[key].get("ellipse95")
             table.add_row(label, *error_cells(metrics[key]), "" if ellipse is None else f"{100 * ellipse:.0f} %")
     return table
+
+
+def _stacked(header: str) -> str:
+    """A header in short words, one below the other, so that eleven columns fit a terminal of 80 characters."""
+    for word, short in _SHORT.items():
+        header = header.replace(word, short)
+    quantity, _, unit = header.partition(" ")
+    return f"{quantity}\n{unit}"
 
 
 def run_title(metrics: dict[str, Any]) -> str:

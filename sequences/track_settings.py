@@ -42,6 +42,10 @@ class TrackSettings:
         The search reaches this many standard deviations of the prediction.
     correlation_length_m
         Distance over which a matcher's errors resemble each other. None: the matcher's own.
+    map_error_m
+        Standard deviation, east and north alike, of where the map draws things against where they are. Neighbouring
+        measurements share it, so no number of them averages it out: it is added to the covariances that are reported.
+        OpenStreetMap is traced from aerial images that are a few decimetres off.
     outlier_probability
         Chance that a measurement says nothing about the pose.
     modes
@@ -68,6 +72,7 @@ class TrackSettings:
     search_margin_m: float = 2.0
     search_sigmas: float = 3.5
     correlation_length_m: float | None = None
+    map_error_m: float = 0.4
     outlier_probability: float = 0.05
     modes: int = 5
     lost_threshold: float = 0.5
@@ -88,12 +93,11 @@ class TrackSettings:
                 raise SkyfixError(f"{name}: expected more than 0, got {getattr(self, name)}")
         if self.half_heading_deg > 180.0:
             raise SkyfixError(f"half_heading_deg: expected at most 180, got {self.half_heading_deg:g}")
-        if self.measure_every_m < 0.0:
-            raise SkyfixError(f"measure_every_m: expected 0 or more, got {self.measure_every_m:g}")
         if self.measure_every_frames is not None and self.measure_every_frames < 1:
             raise SkyfixError(f"measure_every_frames: expected 1 or more, got {self.measure_every_frames}")
-        if self.correlation_length_m is not None and self.correlation_length_m < 0.0:
-            raise SkyfixError(f"correlation_length_m: expected 0 or more, got {self.correlation_length_m:g}")
+        for name in ("measure_every_m", "search_margin_m", "map_error_m", "correlation_length_m", "snapshots"):
+            if (getattr(self, name) or 0) < 0:
+                raise SkyfixError(f"{name}: expected 0 or more, got {getattr(self, name):g}")
         if self.seed < 0:
             raise SkyfixError(f"seed: expected 0 or more, got {self.seed}")
 

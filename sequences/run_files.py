@@ -1,0 +1,44 @@
+"""Run directories on disk: whether a folder is one, whether a new one may go there, and what an old one holds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from fusion.errors import SkyfixError
+
+METRICS_FILE = "metrics.json"
+CONFIG_FILE = "config.yaml"
+
+
+def check_target(out_dir: Path, overwrite: bool) -> None:
+    """Refuse a target that `write_run` would refuse, before any time is spent.
+
+    Raises
+    ------
+    SkyfixError
+        If it exists and is not an empty folder, unless it is a run directory and `overwrite` is set.
+    """
+    if not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir())):
+        return
+    if not is_run_directory(out_dir):
+        raise SkyfixError(f"{out_dir}: exists and is not a run directory; choose another --out")
+    if not overwrite:
+        raise SkyfixError(f"{out_dir}: holds a run already; give --overwrite to replace it, or another --out")
+
+
+def is_run_directory(path: Path) -> bool:
+    """Whether a folder looks like one that `write_run` wrote."""
+    return (path / METRICS_FILE).is_file() and (path / CONFIG_FILE).is_file()
+
+
+def read_metrics(run_dir: Path) -> dict[str, Any]:
+    """The content of a run's `metrics.json`; `SkyfixError` when `run_dir` is not a run directory."""
+    if not is_run_directory(run_dir):
+        raise SkyfixError(f"{run_dir}: expected a run directory ({METRICS_FILE}, {CONFIG_FILE}), found none")
+    try:
+        metrics: dict[str, Any] = json.loads((run_dir / METRICS_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SkyfixError(f"{run_dir / METRICS_FILE}: cannot be read: {error}") from error
+    return metrics

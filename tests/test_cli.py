@@ -1,0 +1,180 @@
+"""The command line: a drive tracked from end to end, its table, its help."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from made_drive import EmulatedMatcher, MadeDrive, write_made_drive
+
+import learned.matcher
+from sequences.cli import app, default_odometry, main
+from sequences.folder import FolderSequence
+from sequences.tables import ROWS
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A command that came to its end."""
+
+    code: int | str | None
+    out: str
+    err: str
+
+
+def skyfix(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Finished:
+    monkeypatch.setattr(sys, "argv", ["skyfix", *arguments])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    printed = capsys.readouterr()
+    return Finished(caught.value.code, printed.out, printed.err)
+
+
+@dataclass(frozen=True)
+class TrackedRun:
+    """A run directory that `skyfix track` wrote, and what it printed."""
+
+    made: MadeDrive
+    out: Path
+    printed: Finished
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> TrackedRun:
+    """`skyfix track` with the emulated matcher on a made-up drive, the report included."""
+    made = write_made_drive(tmp_path_factory.mktemp("cli") / "made_drive")
+    out = made.path.parent / "run"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(made.truth.poses))
+        monkeypatch.setattr(sys, "argv", ["skyfix", "track", str(made.path), "--out", str(out), "--particles", "2000"])
+        stdout, stderr = Lines(), Lines()
+        monkeypatch.setattr(sys, "stdout", stdout)
+        monkeypatch.setattr(sys, "stderr", stderr)
+        with pytest.raises(SystemExit) as caught:
+            main()
+    return TrackedRun(made, out, Finished(caught.value.code, stdout.text, stderr.text))
+
+
+class Lines:
+    """A stream that is not a terminal."""
+
+    encoding = "utf-8"
+
+    def __init__(self) -> None:
+        self.text = ""
+
+    def write(self, text: str) -> int:
+        self.text += text
+        return len(text)
+
+    def flush(self) -> None:
+        """Everything is kept already."""
+
+    def isatty(self) -> bool:
+        return False
+
+
+def test_track_writes_a_run_and_prints_its_table(tracked: TrackedRun) -> None:
+    assert tracked.printed.code == 0
+    metrics = json.loads((tracked.out / "metrics.json").read_text())
+    for key, label in ROWS.items():
+        row = next(line for line in tracked.printed.out.splitlines() if line.strip().startswith(label))
+        assert f"{metrics[key]['position_error_m']['mean']:.2f}" in row
+    assert str(tracked.out / "report.html") in tracked.printed.out
+    assert (tracked.out / "report.html").stat().st_size > 10_000
+    assert max(map(len, tracked.printed.out.split("smoother:")[0].splitlines())) <= 80
+
+
+def test_metrics_have_what_other_programs_read(tracked: TrackedRun) -> None:
+    metrics = json.loads((tracked.out / "metrics.json").read_text())
+    for method in ("prior", "odometry", "single_shot", "filter", "smoother"):
+        summary = metrics[method]
+        assert set(summary["position_error_m"]) == {"mean", "median", "rmse", "max"}
+        assert set(summary["heading_error_deg"]) == {"mean", "median", "max"}
+        for recall in ("lateral_recall", "longitudinal_recall", "heading_recall"):
+            assert set(summary[recall]) == {"1", "3", "5"}
+            assert all(0.0 <= share <= 1.0 for share in summary[recall].values())
+        assert summary["frames"] > 0
+    for method in ("filter", "smoother", "filter_after_first_quarter"):
+        assert set(metrics[method]["nees"]) == {"mean", "dof", "coverage95"}
+        assert 0.0 <= metrics[method]["ellipse95"] <= 1.0
+    assert set(metrics["drift"]) == {"first_quarter_mean_m", "last_quarter_mean_m", "odometry_final_error_m"}
+    assert metrics["odometry_source"] == "wheels"
+    assert set(metrics["seconds_per_frame"]) == {"scan", "match", "predict", "update", "smooth"}
+    assert metrics["realtime_factor"] > 0.0
+    assert (metrics["scans_simulated"], metrics["odometry_emulated"], metrics["skipped_frames"]) == (False, False, 0)
+
+
+def test_view_prints_the_same_table_again(
+    tracked: TrackedRun, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    viewed = skyfix(capsys, monkeypatch, "view", str(tracked.out))
+    assert viewed.code == 0
+    assert viewed.out == tracked.printed.out
+
+
+def test_a_second_run_into_the_same_directory_needs_overwrite(
+    tracked: TrackedRun, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(tracked.made.truth.poses))
+    again = skyfix(capsys, monkeypatch, "track", str(tracked.made.path), "--out", str(tracked.out))
+    assert again.code == 2
+    assert "give --overwrite" in again.err
+
+
+def test_evaluate_prints_the_prior_beside_every_matcher(
+    made_drive: MadeDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matchers = {
+        "sharp": EmulatedMatcher(made_drive.truth.poses, sigma_m=0.3),
+        "blunt": EmulatedMatcher(made_drive.truth.poses, sigma_m=3.0),
+    }
+    monkeypatch.setattr(learned.matcher, "load_matcher", matchers.__getitem__)
+    made_drive.scan_file(0).write_bytes(b"")  # skipped, not fatal: every scan stands for itself
+    arguments = ("evaluate", str(made_drive.path), "--matcher", "sharp", "--matcher", "blunt")
+    done = skyfix(capsys, monkeypatch, *arguments, "--json", str(tmp_path / "shots.json"), "--max-frames", "15")
+    assert done.code == 0
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in done.out.splitlines()]
+    assert [row[1] for row in rows[2:]] == ["prior", "sharp", "blunt"]
+    assert {len(row) for row in rows} == {len(rows[0])}
+    (evaluation,) = json.loads((tmp_path / "shots.json").read_text())
+    assert evaluation["skipped_frames"] == 1
+    mean = {name: summary["position_error_m"]["mean"] for name, summary in evaluation["methods"].items()}
+    assert mean["sharp"] < 0.6 < mean["blunt"] < mean["prior"]
+    assert evaluation["methods"]["prior"]["frames"] == 14
+    assert done.out == skyfix(capsys, monkeypatch, *arguments, "--max-frames", "15").out
+
+
+def test_odometry_that_is_not_emulated_is_preferred(made_drive: MadeDrive) -> None:
+    wheels = made_drive.path / "odometry" / "wheels.tum"
+    wheels.with_name("emulated.tum").write_text(wheels.read_text())
+    assert default_odometry(FolderSequence(made_drive.path)) == "wheels"
+    wheels.unlink()
+    assert default_odometry(FolderSequence(made_drive.path)) == "emulated"
+
+
+@pytest.mark.parametrize(
+    "command", [command.callback.__name__ for command in app.registered_commands if command.callback]
+)
+def test_help_explains_every_option_and_gives_an_example(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    shown = skyfix(capsys, monkeypatch, command, "--help")
+    assert shown.code == 0
+    assert f"skyfix {command}" in shown.out.split("Example")[1]
+    for line in shown.out.splitlines():
+        option = re.match(r"\W*--([a-z-]+)", line)
+        if option:
+            assert len(re.sub(r"[^a-z ]", "", line.lower()).split()) >= 4, f"{option[1]}: no explanation"
+
+
+def test_help_lists_the_commands(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = skyfix(capsys, monkeypatch, "--help")
+    assert shown.code == 0
+    for command in ("demo", "track", "evaluate", "train", "view"):
+        assert re.search(rf"\b{command}\b", shown.out)

@@ -1,0 +1,356 @@
+"""The tracking loop, with an emulated matcher: what it may know, what it must do, what it reports."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from made_drive import STEP_M, EmulatedMatcher, MadeDrive, made_scan
+
+import sequences.run_directory as run_directory
+from fusion import se2
+from fusion.errors import SkyfixError
+from fusion.estimate import Estimate
+from fusion.grid import MapGrid
+from fusion.likelihood import LikelihoodVolume
+from fusion.prior import UniformPrior
+from fusion.trajectory import Trajectory
+from sequences.drive import load_drive
+from sequences.folder import FolderSequence
+from sequences.localize import track
+from sequences.measurement import Measurement
+from sequences.run_directory import write_run
+from sequences.run_metrics import TIMING_KEYS
+from sequences.run_result import FrameRow, RunResult
+from sequences.search import first_search, next_search
+from sequences.sequence import ScanError
+from sequences.start import first_cloud, prior_answers, start_prior
+from sequences.track_settings import TrackSettings
+from sequences.trajectory_io import read_tum
+
+SETTINGS = TrackSettings("wheels", seed=3, particles=3000)
+
+
+def run(made: MadeDrive, settings: TrackSettings = SETTINGS, **matcher: Any) -> RunResult:
+    return track(FolderSequence(made.path), EmulatedMatcher(made.truth.poses, **matcher), settings)
+
+
+def lasting(metrics: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in metrics.items() if key not in TIMING_KEYS}
+
+
+def test_fusion_beats_its_parts(made_drive: MadeDrive) -> None:
+    metrics = run(made_drive).metrics
+    mean = {name: metrics[name]["position_error_m"]["mean"] for name in ("prior", "odometry", "single_shot", "filter")}
+    assert mean["filter"] < 0.8
+    assert mean["filter"] < mean["odometry"]
+    assert mean["filter"] < mean["prior"]
+    assert metrics["smoother"]["position_error_m"]["mean"] < mean["single_shot"]
+    assert metrics["filter_after_first_quarter"]["lateral_recall"]["1"] == 1.0
+    assert metrics["measured_frames"] == 15
+    assert metrics["single_shot"]["frames"] == 15
+    assert metrics["filter"]["frames"] == 30
+    assert metrics["length_m"] == pytest.approx(29 * STEP_M, rel=0.01)
+
+
+def test_same_seed_same_numbers_other_seed_others(made_drive: MadeDrive) -> None:
+    first, again = run(made_drive), run(made_drive)
+    assert json.dumps(lasting(first.metrics)) == json.dumps(lasting(again.metrics))
+    np.testing.assert_array_equal(first.filter.poses, again.filter.poses)
+    np.testing.assert_array_equal(first.smoother.poses, again.smoother.poses)
+    other = run(made_drive, replace(SETTINGS, seed=4))
+    assert not np.array_equal(first.prior.mean, other.prior.mean)
+    assert lasting(other.metrics)["filter"] != lasting(first.metrics)["filter"]
+
+
+def test_the_truth_is_not_tracked_with(made_drive: MadeDrive) -> None:
+    settings = replace(SETTINGS, start=(-22.0, -12.0, 20.0))
+    with_truth = run(made_drive, settings)
+    (made_drive.path / "ground_truth.tum").unlink()
+    without = run(made_drive, settings)
+    np.testing.assert_array_equal(without.filter.poses, with_truth.filter.poses)
+    np.testing.assert_array_equal(without.smoother.poses, with_truth.smoother.poses)
+    assert without.truth is None
+    assert without.metrics["ground_truth"] is False
+    assert "filter" not in without.metrics
+    assert without.length_m == pytest.approx(made_drive.odometry.length_m)
+
+
+def test_the_true_start_is_anywhere_in_the_prior(made_drive: MadeDrive) -> None:
+    drive = load_drive(FolderSequence(made_drive.path), "wheels")
+    priors = [start_prior(drive, replace(SETTINGS, seed=seed)) for seed in range(400)]
+    true_start = drive.truth.poses[0] if drive.truth is not None else np.zeros(3)
+    offsets = np.array([prior.mean - true_start for prior in priors])
+    offsets[:, 2] = se2.wrap(offsets[:, 2])
+    assert all(prior.contains(true_start) for prior in priors)
+    half = np.array([20.0, 20.0, np.deg2rad(10.0)])
+    # Uniform over +-half: mean 0 with deviation half / sqrt(3 * 400), mean square half^2 / 3.
+    np.testing.assert_array_less(np.abs(offsets.mean(axis=0)), 4.0 * half / np.sqrt(3 * 400))
+    np.testing.assert_allclose((offsets**2).mean(axis=0), half**2 / 3.0, rtol=0.2)
+
+
+def test_the_prior_scores_what_the_middle_of_its_box_scores() -> None:
+    n = 20_000
+    truth = Trajectory(np.arange(n, dtype=np.int64), np.column_stack([np.arange(n), np.zeros((n, 2))]))
+    answers = prior_answers(truth, TrackSettings("any"))
+    distance = np.hypot(*(answers.poses - truth.poses)[:, :2].T)
+    # Mean distance of a uniform point in a square to its centre: half side * (sqrt 2 + ln(1 + sqrt 2)) / 3 = 15.304 m.
+    assert distance.mean() == pytest.approx(20.0 * (np.sqrt(2) + np.log(1 + np.sqrt(2))) / 3.0, abs=0.15)
+    heading_deg = np.rad2deg(np.abs(se2.wrap(answers.poses[:, 2] - truth.poses[:, 2])))
+    assert heading_deg.mean() == pytest.approx(5.0, abs=0.1)
+
+
+def test_searches_follow_the_filter_and_start_with_the_whole_box(made_drive: MadeDrive) -> None:
+    matcher = EmulatedMatcher(made_drive.truth.poses)
+    result = track(FolderSequence(made_drive.path), matcher, SETTINGS)
+    first = matcher.searches[0]
+    np.testing.assert_array_equal(first.centre, result.prior.mean)
+    assert first.half_extent_m == 22.0
+    assert np.rad2deg(first.half_heading_rad) == pytest.approx(11.0)
+    measured = [row for row in result.frame_rows if row.measured]
+    assert len(measured) == len(matcher.searches)
+    for search, row in zip(matcher.searches[1:], measured[1:], strict=True):
+        assert 12.0 <= search.half_extent_m <= 24.0
+        assert np.deg2rad(6.0) <= search.half_heading_rad <= np.pi
+        assert (row.search_half_extent_m, row.search_half_heading_rad) == (
+            search.half_extent_m,
+            search.half_heading_rad,
+        )
+        frame = int(np.flatnonzero(result.stamps_ns == row.stamp_ns)[0])
+        assert np.hypot(*(search.centre - result.filter.poses[frame])[:2]) < 3.0
+        assert not np.array_equal(search.centre, made_drive.truth.poses[frame])
+
+
+def estimate(sigma_m: float, sigma_rad: float) -> Estimate:
+    covariance = np.diag([sigma_m**2, (0.5 * sigma_m) ** 2, sigma_rad**2])
+    return Estimate(0, np.array([1.0, 2.0, 0.3]), covariance, None, 100.0, 0.0, 0.0)
+
+
+def test_a_search_is_as_wide_as_the_filter_is_unsure_within_bounds() -> None:
+    prior = UniformPrior(np.zeros(3), 20.0, np.deg2rad(10.0))
+    for sigma, expected in [(0.1, 12.0), (5.0, 17.5), (50.0, 24.0)]:
+        assert next_search(estimate(sigma, 0.01), prior, SETTINGS, lost=False).half_extent_m == pytest.approx(expected)
+    for sigma, expected in [(0.001, np.deg2rad(6.0)), (0.1, 0.35), (2.0, np.pi)]:
+        assert next_search(estimate(1.0, sigma), prior, SETTINGS, lost=False).half_heading_rad == pytest.approx(
+            expected
+        )
+    lost = next_search(estimate(0.1, 0.001), prior, SETTINGS, lost=True)
+    assert (lost.half_extent_m, np.rad2deg(lost.half_heading_rad)) == pytest.approx((24.0, 45.0))
+    wide = UniformPrior(np.zeros(3), 60.0, np.pi)
+    assert first_search(wide, SETTINGS).half_heading_rad == np.pi
+    assert next_search(estimate(50.0, 0.01), wide, SETTINGS, lost=False).half_extent_m == pytest.approx(62.0)
+
+
+@pytest.mark.parametrize(("every_m", "gap"), [(0.0, 1), (4.0, 2), (10.0, 5)])
+def test_scans_are_measured_every_so_many_metres(made_drive: MadeDrive, every_m: float, gap: int) -> None:
+    result = run(made_drive, replace(SETTINGS, measure_every_m=every_m))
+    measured = np.flatnonzero([row.measured for row in result.frame_rows])
+    assert measured[0] == 0
+    assert set(np.diff(measured)) == {gap}  # the odometry is 3 % long: 2.06 m a frame
+
+
+def test_scans_are_measured_every_so_many_frames(made_drive: MadeDrive) -> None:
+    result = run(made_drive, replace(SETTINGS, measure_every_frames=7))
+    assert np.flatnonzero([row.measured for row in result.frame_rows]).tolist() == [0, 7, 14, 21, 28]
+
+
+def test_correlated_errors_flatten_every_measurement_but_the_first(made_drive: MadeDrive) -> None:
+    rows = run(made_drive, error_correlation_length_m=10.0).frame_rows
+    temperatures = [row.temperature for row in rows if row.measured]
+    rho = np.exp(-2 * 1.03 * STEP_M / 10.0)
+    assert temperatures[0] == 1.0
+    np.testing.assert_allclose(temperatures[1:], (1 + rho) / (1 - rho), rtol=1e-3)
+    overridden = run(made_drive, replace(SETTINGS, correlation_length_m=0.0), error_correlation_length_m=10.0)
+    assert {row.temperature for row in overridden.frame_rows if row.measured} == {1.0}
+
+
+def test_a_bad_scan_is_skipped_and_reported(made_drive: MadeDrive) -> None:
+    made_drive.scan_file(6).write_bytes(b"")
+    result = run(made_drive, replace(SETTINGS, measure_every_frames=3))
+    row = result.frame_rows[6]
+    assert not row.measured
+    assert "expected points, got none" in row.skipped_reason
+    assert result.metrics["skipped_frames"] == 1
+    assert any("frame 6" in line and "expected points" in line for line in result.log)
+    assert result.frame_rows[7].measured  # the next one takes its place
+    assert result.metrics["filter"]["position_error_m"]["max"] < 3.0
+
+
+def test_a_first_scan_that_is_bad_ends_the_run(made_drive: MadeDrive) -> None:
+    points = made_scan(0)
+    points[3, 2] = np.inf
+    points.tofile(made_drive.scan_file(0))
+    with pytest.raises(ScanError, match=r"scan 000000\.bin: expected finite points"):
+        run(made_drive)
+
+
+def test_odometry_that_covers_a_part_tracks_that_part(made_drive: MadeDrive) -> None:
+    lines = (made_drive.path / "odometry" / "wheels.tum").read_text().splitlines()
+    (made_drive.path / "odometry" / "wheels.tum").write_text("\n".join(lines[5:25]) + "\n")
+    result = run(made_drive)
+    np.testing.assert_array_equal(result.stamps_ns, made_drive.truth.stamp_ns[5:25])
+    assert [row.index for row in result.frame_rows] == list(range(5, 25))
+    assert result.metrics["filter"]["position_error_m"]["mean"] < 1.0
+    assert any("10 frames left out" in line for line in result.log)
+
+
+def test_an_unknown_heading_is_found(made_drive: MadeDrive) -> None:
+    result = run(made_drive, replace(SETTINGS, half_heading_deg=180.0))
+    assert result.prior.half_heading_rad == np.pi
+    assert result.metrics["filter"]["heading_error_deg"]["mean"] < 2.0
+
+
+def test_reported_covariances_include_the_maps_own_error(made_drive: MadeDrive) -> None:
+    without = run(made_drive, replace(SETTINGS, map_error_m=0.0))
+    with_error = run(made_drive, replace(SETTINGS, map_error_m=0.7))
+    for name in ("filter", "smoother"):
+        added = getattr(with_error, name).covariances - getattr(without, name).covariances
+        np.testing.assert_allclose(added, np.broadcast_to(np.diag([0.49, 0.49, 0.0]), added.shape), atol=1e-12)
+
+
+def test_progress_hears_of_every_frame(made_drive: MadeDrive) -> None:
+    class Recorder:
+        def __init__(self) -> None:
+            self.frames = 0
+            self.errors: list[float | None] = []
+
+        def start(self, frames: int) -> None:
+            self.frames = frames
+
+        def frame(self, row: FrameRow, error_m: float | None) -> None:
+            self.errors.append(error_m)
+
+    recorder = Recorder()
+    result = track(FolderSequence(made_drive.path), EmulatedMatcher(made_drive.truth.poses), SETTINGS, recorder)
+    assert recorder.frames == len(recorder.errors) == 30
+    expected = np.hypot(*(result.filter.poses - made_drive.truth.poses)[:, :2].T)
+    np.testing.assert_allclose(np.array(recorder.errors, dtype=float), expected, atol=1e-6)
+
+
+def test_the_first_cloud_is_the_likelihood_cut_to_the_box() -> None:
+    grid = MapGrid(80, 80, 0.5, -20.0, -20.0)
+    x, y = grid.centres()
+    yaw = np.arange(72) * 2.0 * np.pi / 72
+    squared = ((x[None, :, None] - 4.0) / 3.0) ** 2 + ((y[:, None, None] + 1.0) / 2.0) ** 2 + (se2.wrap(yaw) / 0.2) ** 2
+    likelihood = LikelihoodVolume.from_scores(-0.5 * squared, grid)
+    prior = UniformPrior(np.zeros(3), 4.0, 0.5)
+    cloud = first_cloud(likelihood, prior, 20_000, 0.1, np.random.default_rng(0))
+    assert cloud.shape == (20_000, 3)
+    assert prior.contains(cloud).all()
+    # x of the likelihood cut at its mean, 4, and at -4 is nearly half a normal, mean 4 - 3 sqrt(2 / pi); 10 % have 0.
+    cut = 4.0 - 3.0 * (np.sqrt(2 / np.pi) * (1 - np.exp(-0.5 * (8 / 3) ** 2)) / 0.9923)
+    assert cloud[:, 0].mean() == pytest.approx(0.9 * cut, abs=0.06)
+
+
+def test_the_first_cloud_falls_back_on_the_box_when_the_likelihood_lies_elsewhere() -> None:
+    grid = MapGrid(80, 80, 0.5, -20.0, -20.0)
+    scores = np.full((80, 80, 36), -200.0)
+    scores[3, 76, :] = 0.0  # a corner of the crop
+    likelihood = LikelihoodVolume.from_scores(scores, grid)
+    prior = UniformPrior(np.zeros(3), 5.0, 0.5)
+    cloud = first_cloud(likelihood, prior, 500, 0.05, np.random.default_rng(0))
+    assert cloud.shape == (500, 3)
+    assert prior.contains(cloud).all()
+
+
+@pytest.mark.parametrize("yaw", [0.02, 3.1, -3.13])
+def test_the_best_pose_is_finer_than_a_cell(yaw: float) -> None:
+    grid = MapGrid(60, 60, 0.5, -15.0, -15.0)
+    x, y = grid.centres()
+    bins = np.arange(120) * 2.0 * np.pi / 120
+    squared = ((x[None, :, None] - 1.37) ** 2 + (y[:, None, None] + 2.21) ** 2) / 0.3**2
+    squared = squared + (se2.wrap(bins - yaw) / np.deg2rad(2.0)) ** 2
+    volume = LikelihoodVolume.from_scores(-0.5 * squared, grid)
+    search = first_search(UniformPrior(np.zeros(3), 10.0, np.pi), SETTINGS)
+    best = Measurement(np.zeros((1, 4), np.float32), search, volume, 1.0).best_pose()
+    assert np.hypot(best[0] - 1.37, best[1] + 2.21) < 0.1
+    assert abs(se2.wrap(best[2] - yaw)) < np.deg2rad(0.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"particles": 0}, "particles: expected more than 0"),
+        ({"half_extent_m": -1.0}, "half_extent_m: expected more than 0"),
+        ({"half_heading_deg": 200.0}, "half_heading_deg: expected at most 180"),
+        ({"half_extent_m": float("nan")}, "half_extent_m: expected a finite number"),
+        ({"start": (0.0, float("inf"), 0.0)}, "start: expected a finite number"),
+        ({"measure_every_m": -4.0}, "measure_every_m: expected 0 or more"),
+        ({"measure_every_frames": 0}, "measure_every_frames: expected 1 or more"),
+        ({"correlation_length_m": -1.0}, "correlation_length_m: expected 0 or more"),
+        ({"seed": -1}, "seed: expected 0 or more"),
+    ],
+)
+def test_settings_are_checked(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(SkyfixError, match=message):
+        replace(SETTINGS, **changes)
+
+
+@pytest.fixture
+def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the report's figures to their own tests."""
+
+    def write_empty(result: RunResult, out_dir: Path) -> Path:
+        (out_dir / "report.html").write_text("")
+        return out_dir / "report.html"
+
+    monkeypatch.setattr(run_directory, "write_report", write_empty)
+
+
+@pytest.mark.usefixtures("without_report")
+def test_a_run_directory_holds_the_run(made_drive: MadeDrive, tmp_path: Path) -> None:
+    result = run(made_drive)
+    write_run(result, tmp_path / "runs" / "one")
+    out = tmp_path / "runs" / "one"
+    names = {"config.yaml", "metrics.json", "report.html", "frames.csv", "log.txt"}
+    names |= {f"{method}.tum" for method in ("filter", "smoother", "odometry", "single_shot")}
+    assert {file.name for file in out.iterdir()} == names
+    assert [entry.name for entry in out.parent.iterdir()] == ["one"]
+    assert json.loads((out / "metrics.json").read_text()) == result.metrics
+    np.testing.assert_allclose(read_tum(out / "filter.tum").poses, result.filter.poses, atol=1e-8)
+    config = yaml.safe_load((out / "config.yaml").read_text())
+    assert (config["seed"], config["odometry"], config["matcher"]) == (3, "wheels", "emulated")
+    assert config["noise"]["longitudinal_m_per_sqrt_m"] == result.settings.noise.longitudinal_m_per_sqrt_m
+    with (out / "frames.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 30
+    errors = [float(line["smoother_error_m"]) for line in lines]
+    assert np.mean(errors) == pytest.approx(result.metrics["smoother"]["position_error_m"]["mean"], abs=1e-4)
+    assert (lines[0]["measured"], lines[1]["measured"]) == ("1", "0")
+    assert lines[1]["log_evidence"] == lines[1]["match_ms"] == ""
+
+
+@pytest.mark.usefixtures("without_report")
+def test_a_run_is_replaced_only_when_asked_and_anything_else_never(made_drive: MadeDrive, tmp_path: Path) -> None:
+    result, out = run(made_drive), tmp_path / "out"
+    out.mkdir()  # an empty folder is there to be filled
+    write_run(result, out)
+    with pytest.raises(SkyfixError, match="holds a run already; give --overwrite"):
+        write_run(result, out)
+    (out / "mine.txt").write_text("of the old run")
+    write_run(result, out, overwrite=True)
+    assert not (out / "mine.txt").exists()
+    other = tmp_path / "holiday"
+    other.mkdir()
+    (other / "photo.png").write_bytes(b"1")
+    with pytest.raises(SkyfixError, match="exists and is not a run directory"):
+        write_run(result, other, overwrite=True)
+    assert (other / "photo.png").exists()
+
+
+def test_a_run_that_cannot_be_written_leaves_nothing(
+    made_drive: MadeDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(result: RunResult, out_dir: Path) -> Path:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(run_directory, "write_report", fail)
+    with pytest.raises(SkyfixError, match="cannot be written: No space left on device"):
+        write_run(run(made_drive), tmp_path / "runs" / "one")
+    assert list((tmp_path / "runs").iterdir()) == []
