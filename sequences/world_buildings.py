@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion.grid import MapGrid
 from sequences import paint
@@ -19,7 +18,6 @@ from sequences.world_terrain import smooth_noise
 
 def displaced(
     areas: list[Area],
-    offset: NDArray[np.float64],
     layers: WorldLayers,
     style: WorldStyle,
     rng: np.random.Generator,
@@ -33,7 +31,7 @@ def displaced(
         centre = area.rings[0].mean(axis=0)
         rc = np.floor(coarse.pixel_from_xy(centre)).astype(int)
         row, col = np.clip(rc, 0, [coarse.rows - 1, coarse.cols - 1])
-        shift = offset + np.array([field[0][row, col], field[1][row, col]]) + rng.normal(0.0, 0.08, 2)
+        shift = np.array([field[0][row, col], field[1][row, col]]) + rng.normal(0.0, 0.08, 2)
         turn = np.deg2rad(rng.normal(0.0, style.building_turn_deg))
         cos, sin = np.cos(turn), np.sin(turn)
         rotation = np.array([[cos, sin], [-sin, cos]])
@@ -74,7 +72,7 @@ def add_building(layers: WorldLayers, area: Area, style: WorldStyle, rng: np.ran
             bottom = rng.uniform(2.2, 3.0)
             layers.crowns.polygon([box], bottom + rng.uniform(0.9, 6.0), Material.FENCE, bottom, 8.0)
         elif kind < 0.8:
-            layers.solid.polygon([box], rng.uniform(2.2, height), Material.BUILDING)
+            layers.solid.polygon([box], rng.uniform(2.2, max(height, 2.3)), Material.BUILDING)
         else:
             layers.solid.polygon([box], rng.uniform(0.3, 1.2), Material.WALL)
 
