@@ -7,15 +7,52 @@ maximum likelihood of the true poses (Guo et al., "On Calibration of Modern Neur
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from fusion.errors import SkyfixError
+from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
+from learned.map_raster import MapRaster
+from learned.matcher import SearchRegion
+from learned.samples import SAMPLE_METRES_PER_PIXEL, Sample
 
 _LOG_TEMPERATURE_BOUNDS = (np.log(0.05), np.log(50.0))
+
+
+class CountsMatcher(Protocol):
+    """A matcher that takes a bird's-eye view that has been made already."""
+
+    def match_counts(
+        self, counts: NDArray[np.float32], map_raster: MapRaster, search: SearchRegion
+    ) -> LikelihoodVolume:
+        """Likelihood of the poses in a search region."""
+        ...
+
+
+def match_samples(
+    matcher: CountsMatcher, samples: Sequence[Sample], half_extent_m: float, half_heading_rad: float, seed: int
+) -> tuple[list[LikelihoodVolume], NDArray[np.float64]]:
+    """Match samples within boxes that lie about the truth at seeded uniform offsets.
+
+    Returns
+    -------
+    The volumes, and the true poses (N, 3), each in the frame of its sample's class raster (origin at its lower left corner).
+    """
+    rng = np.random.default_rng(seed)
+    half = np.array([half_extent_m, half_extent_m, half_heading_rad])
+    volumes, truths = [], []
+    for sample in samples:
+        grid = MapGrid(sample.classes.shape[0], sample.classes.shape[1], SAMPLE_METRES_PER_PIXEL, 0.0, 0.0)
+        truth = np.array([*grid.xy_from_pixel((sample.row, sample.col)), sample.yaw])
+        search = SearchRegion(truth + rng.uniform(-half, half), half_extent_m, half_heading_rad)
+        raster = MapRaster.from_classes(grid, sample.classes)
+        volumes.append(matcher.match_counts(sample.counts.astype(np.float32), raster, search))
+        truths.append(truth)
+    return volumes, np.array(truths)
 
 
 def mean_nll(

