@@ -1,13 +1,10 @@
-# make setup | demo | test | lint | benchmark | clean          (PYTHON=python3.12 make setup takes another interpreter)
+# make setup | demo | test | lint | format | clean          (PYTHON=python3.12 make setup takes another interpreter)
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-# One thread a test process: two of them share the machine, and sums then have the same order everywhere.
-export OMP_NUM_THREADS ?= 1
-
-.PHONY: setup demo test lint format benchmark clean
+.PHONY: setup demo test lint format clean
 
 setup: $(READY)
 
@@ -23,7 +20,7 @@ demo: setup
 	$(BIN)/skyfix demo
 
 test: setup
-	$(BIN)/python -m pytest -q -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 lint: setup
 	$(BIN)/ruff check .
@@ -33,9 +30,6 @@ lint: setup
 format: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-
-benchmark: setup
-	$(BIN)/skyfix benchmark
 
 clean:
 	rm -rf build dist runs *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -50,8 +50,9 @@ def test_a_network_that_knows_nothing_is_uniform(namespace: dict[str, Any]) -> N
 
 
 def named_commands() -> dict[str, set[str]]:
-    """Subcommands of skyfix that the README names, in shell blocks and inline, each with the options shown for it."""
-    texts = [*blocks("sh"), *re.findall(r"`([^`\n]+)`", README)]
+    """Subcommands that the README (shell blocks, inline) and the Makefile name, with the options shown for each."""
+    makefile = re.findall(r"\$\(BIN\)/(skyfix .*)", (ROOT / "Makefile").read_text(encoding="utf-8"))
+    texts = [*blocks("sh"), *re.findall(r"`([^`\n]+)`", README), *makefile]
     found: dict[str, set[str]] = {}
     for command, rest in re.findall(r"\bskyfix ([a-z]+)([^#\n]*)", "\n".join(texts)):
         found.setdefault(command, set()).update(re.findall(r"--[a-z-]+", rest))
@@ -59,7 +60,7 @@ def named_commands() -> dict[str, set[str]]:
 
 
 def test_readme_names_commands() -> None:
-    assert {"track", "evaluate", "view"} <= set(named_commands())
+    assert {"demo", "track", "evaluate", "view"} <= set(named_commands())
     assert len(named_commands()["track"]) >= 3
 
 

@@ -104,10 +104,10 @@ def _worst_box(result: RunResult, series: RunSeries) -> tuple[Box, str]:
     poses = result.filter.poses[result.filter.stamp_ns >= stamps[0]]
     if "filter" in series.errors:
         errors = series.errors["filter"].position_m[-len(poses) :]
-        at, title = int(errors.argmax()), f"The filter's worst: {errors.max():.2f} m"
+        at, title = int(errors.argmax()), f"Worst after the first quarter: {errors.max():.2f} m"
     elif result.filter.covariances is not None:
         spread = np.trace(result.filter.covariances[-len(poses) :, :2, :2], axis1=1, axis2=2)
-        at, title = int(spread.argmax()), "Where the filter is least sure"
+        at, title = int(spread.argmax()), "Least sure after the first quarter"
     else:
         at, title = len(poses) - 1, "The end"
     x, y = (float(value) for value in poses[at, :2])
