@@ -60,6 +60,30 @@ class GaussianMixture:
         log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         return np.log(self.weights) - 0.5 * ((white**2).sum(axis=-1) + log_det + 3.0 * np.log(se2.TWO_PI))
 
+    def tempered(self, temperature: float) -> "GaussianMixture":
+        """Flatten as a power 1 / temperature does where the components do not overlap, strongest component first.
+
+        Every Gaussian keeps its place and gets `temperature` times its covariance; how much the components' peaks
+        differ shrinks by the same power. The total weight stays.
+
+        Tempering a density cell by cell and taking the moments afterwards is not the same: far from Gaussian, its
+        wide skirts take over the mass and draw the means away from the peaks.
+
+        Raises
+        ------
+        SkyfixError
+            When the temperature is not positive.
+        """
+        if not (np.isfinite(temperature) and temperature > 0.0):
+            raise SkyfixError(f"temperature: expected > 0, got {temperature}")
+        half_log_det = 0.5 * np.linalg.slogdet(self.covariances)[1]
+        log_peak = np.log(self.weights) - half_log_det
+        log_weight = log_peak / temperature + half_log_det  # the new half_log_det differs by the same amount for all
+        weights = np.exp(log_weight - logsumexp(log_weight)) * self.weights.sum()
+        order = np.argsort(-weights, kind="stable")
+        weights = np.maximum(weights[order], np.finfo(np.float64).tiny)
+        return GaussianMixture(weights, self.means[order], temperature * self.covariances[order])
+
     def log_density(self, poses: ArrayLike) -> FloatArray:
         """ln density (N,) of the sum of the components at poses (N, 3)."""
         return np.asarray(logsumexp(self.component_log_density(poses), axis=1))

@@ -1,9 +1,9 @@
 """Bird's-eye views of LiDAR scans: point counts a cell and height band, above a locally estimated ground.
 
-The image has the map's convention with the vehicle at its centre: body x along +columns, body y against rows, so that a vehicle of
-heading zero needs no rotation to lie on the map. Heights are measured above a ground surface that may slope: on real roads a plane
-through the sensor's foot turns a hill into a wall. The band between 0.3 m and 1 m (parked cars, kerbs, grass) is left out, because
-it is on no map and is what simulations get wrong.
+The image has the map's convention with the vehicle at its centre: body x along +columns, body y against rows, so that
+a vehicle of heading zero needs no rotation to lie on the map. Heights are measured above a ground surface that may
+slope: on real roads a plane through the sensor's foot turns a hill into a wall. The band between 0.3 m and 1 m
+(parked cars, kerbs, grass) is left out, because it is on no map and is what simulations get wrong.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def check_scan(points: NDArray[np.floating]) -> None:
 def ground_surface(points: NDArray[np.floating], ground_z: float, half_extent_m: float) -> Float32Array:
     """Estimate the height of the ground in the scan's frame on a grid of 1 m cells.
 
-    The lowest return of each cell, made consistent with a largest slope: the lower envelope of cones of 15 % put on every cell.
-    Cells without returns (behind walls, on roofs) get what their neighbours allow. Returns far below the expected ground
-    (reflections) are ignored.
+    The lowest return of each cell, made consistent with a largest slope: the lower envelope of cones of 15 % put on
+    every cell. Cells without returns (behind walls, on roofs) get what their neighbours allow. Returns far below the
+    expected ground (reflections) are ignored.
 
     Parameters
     ----------
@@ -81,7 +81,9 @@ def ground_surface(points: NDArray[np.floating], ground_z: float, half_extent_m:
     surface = lowest.reshape(size, size)
     middle = slice(size // 2 - 2, size // 2 + 2)
     surface[middle, middle] = np.minimum(surface[middle, middle], np.float32(ground_z))
-    return np.asarray(cv2.GaussianBlur(_cone_envelope(surface, _GROUND_SLOPE * _GROUND_CELL_M), (0, 0), 1.0), np.float32)
+    return np.asarray(
+        cv2.GaussianBlur(_cone_envelope(surface, _GROUND_SLOPE * _GROUND_CELL_M), (0, 0), 1.0), np.float32
+    )
 
 
 def _cone_envelope(surface: Float32Array, rise_per_cell: float) -> Float32Array:

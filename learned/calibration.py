@@ -1,7 +1,8 @@
 """Calibration on held-out data: how far a matcher's likelihoods may be believed.
 
-A network that was trained on other maps, or weights chosen by hand, give scores on a scale of their own. One temperature, fitted by
-maximum likelihood of the true poses (Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, section 4.2), puts them right.
+A network that was trained on other maps, or weights chosen by hand, give scores on a scale of their own. One
+temperature, fitted by maximum likelihood of the true poses (Guo et al., "On Calibration of Modern Neural Networks",
+ICML 2017, section 4.2), puts them right.
 """
 
 from __future__ import annotations
@@ -38,9 +39,8 @@ def match_samples(
 ) -> tuple[list[LikelihoodVolume], NDArray[np.float64]]:
     """Match samples within boxes that lie about the truth at seeded uniform offsets.
 
-    Returns
-    -------
-    The volumes, and the true poses (N, 3), each in the frame of its sample's class raster (origin at its lower left corner).
+    Returns ------- The volumes, and the true poses (N, 3), each in the frame of its sample's class raster (origin at
+    its lower left corner).
     """
     rng = np.random.default_rng(seed)
     half = np.array([half_extent_m, half_extent_m, half_heading_rad])
@@ -60,7 +60,8 @@ def mean_nll(
 ) -> float:
     """Mean negative log density, per m^2 rad, of the true poses (N, 3) under volumes at a temperature.
 
-    `outliers` is the weight of the uniform density that a filter mixes in; with it a single wild frame does not decide the fit.
+    `outliers` is the weight of the uniform density that a filter mixes in; with it a single wild frame does not
+    decide the fit.
     """
     values = [
         volume.tempered(temperature).with_outliers(outliers).log_density(truth[None])[0]
@@ -69,9 +70,7 @@ def mean_nll(
     return -float(np.mean(values))
 
 
-def fit_temperature(
-    volumes: Sequence[LikelihoodVolume], truths: NDArray[np.float64], outliers: float = 0.05
-) -> float:
+def fit_temperature(volumes: Sequence[LikelihoodVolume], truths: NDArray[np.float64], outliers: float = 0.05) -> float:
     """Temperature that makes the true poses most likely.
 
     Parameters

@@ -1,8 +1,8 @@
 """The baseline with no learning: hand-made features of scan and map, matched by voting.
 
-Three statements, each a term of one correlation: things that stand up lie on mapped walls, fences, hedges and building outlines;
-they do not lie inside buildings; ground that the scan sees is near roads and not under buildings. It is hard to beat and shows at
-once when an axis or a sign is wrong.
+Three statements, each a term of one correlation: things that stand up lie on mapped walls, fences, hedges and
+building outlines; they do not lie inside buildings; ground that the scan sees is near roads and not under buildings.
+It is hard to beat and shows at once when an axis or a sign is wrong.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LINE_STRENGTH = {"wall": 1.0, "fence": 1.0, "hedge": 0.7, "tree": 0.4}
 
 @dataclass(frozen=True, slots=True)
 class GeometricWeights:
-    """Weights of the terms, per obstacle cell (wall, interior) or ground cell (road, building), and widths of the soft edges."""
+    """Weights per obstacle cell (wall, interior) and per ground cell (road, building); widths of the soft edges."""
 
     wall: float = 1.0
     interior: float = 1.5
@@ -48,7 +48,8 @@ class GeometricMatcher:
     temperature
         Divides the scores before they are normalised; fitted on simulated neighbourhoods.
     error_correlation_length_m
-        Distance over which the errors of neighbouring frames decorrelate: they come from the map and from what the map lacks.
+        Distance over which the errors of neighbouring frames decorrelate: they come from the map and from what the
+        map lacks.
     """
 
     bev: BevSettings = field(default_factory=BevSettings)

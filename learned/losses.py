@@ -1,8 +1,8 @@
 """The likelihood of the truth under a voted volume, as a loss.
 
-The normaliser of the volume is an integral over position and heading. Positions are summed exactly; headings by a quadrature that
-is fine about the truth, where the density is sharp, and coarse with a random phase elsewhere, where it is enough to find false
-modes. Each heading counts with the width of the circle that it stands for.
+The normaliser of the volume is an integral over position and heading. Positions are summed exactly; headings by a
+quadrature that is fine about the truth, where the density is sharp, and coarse with a random phase elsewhere, where
+it is enough to find false modes. Each heading counts with the width of the circle that it stands for.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from learned.voting import vote
 
 @dataclass(frozen=True, slots=True)
 class HeadingQuadrature:
-    """Headings that are scored in training: `fine` of them `fine_step_deg` apart about the truth, `coarse` on the rest."""
+    """Headings scored in training: `fine` ones `fine_step_deg` apart about the truth, `coarse` ones on the rest."""
 
     fine: int = 9
     fine_step_deg: float = 1.5
     coarse: int = 12
 
     def draw(self, yaw: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Yaws (R,) and their widths (R,) in radians; the fine ones come first, and the truth lies between two of them."""
+        """Yaws (R,) and widths (R,), radians; the fine ones come first and the truth lies between two of them."""
         phase_fine, phase_coarse = torch.rand(2, generator=generator).tolist()
         step = math.radians(self.fine_step_deg)
         fine = yaw + (torch.arange(self.fine) - (self.fine // 2) + phase_fine - 0.5) * step
@@ -63,7 +63,9 @@ def truth_nll(
     half = scan_features.shape[-1] / 2
     middle = torch.stack([scores[k] for k in _neighbours(yaws, yaw, quadrature.fine)])
     weight = float((yaw - yaws[_neighbours(yaws, yaw, quadrature.fine)[0]]) / math.radians(quadrature.fine_step_deg))
-    at_yaw = torch.lerp(_bilinear(middle[0], row - half, col - half), _bilinear(middle[1], row - half, col - half), weight)
+    at_yaw = torch.lerp(
+        _bilinear(middle[0], row - half, col - half), _bilinear(middle[1], row - half, col - half), weight
+    )
     return normaliser - at_yaw
 
 

@@ -1,9 +1,9 @@
 """Maps as a network sees them: one class vocabulary, one palette, windows of any size.
 
-Every source (OpenStreetMap, semantic rasters, segmented aerial images) is brought to the classes below and from there to one
-3-channel picture, so that one checkpoint serves them all. The palette is chosen so that the channels mean something by
-themselves: red is how much a thing stands in the way of a laser (buildings, walls, fences), green is vegetation, blue is ground
-that is paved. Aerial photographs have a picture and no classes.
+Every source (OpenStreetMap, semantic rasters, segmented aerial images) is brought to the classes below and from there
+to one 3-channel picture, so that one checkpoint serves them all. The palette is chosen so that the channels mean
+something by themselves: red is how much a thing stands in the way of a laser (buildings, walls, fences), green is
+vegetation, blue is ground that is paved. Aerial photographs have a picture and no classes.
 """
 
 from __future__ import annotations

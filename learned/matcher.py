@@ -1,4 +1,4 @@
-"""What turns a scan and a map into a likelihood: the protocol every network and baseline follows, and how one is loaded."""
+"""What turns a scan and a map into a likelihood: the protocol of every network and baseline, and how one is loaded."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ def matching_window(
 ) -> MapGrid:
     """Grid of the map crop that a search needs: positions within the half extent, and the scan's reach around them.
 
-    It is snapped to the map's pixels where both have the same resolution, so that cropping copies pixels and does not resample.
-    Its side is a multiple of an even number of pixels (what a network's strides ask for).
+    It is snapped to the map's pixels where both have the same resolution, so that cropping copies pixels and does not
+    resample. Its side is a multiple of an even number of pixels (what a network's strides ask for).
     """
     size = multiple_of * math.ceil(2 * (search.half_extent_m + reach_m) / metres_per_pixel / multiple_of)
     half_pixels = size // 2
@@ -98,7 +98,7 @@ def matching_window(
 
 
 def load_matcher(name_or_path: str) -> MapMatcher:
-    """Load a matcher by name ('rotmatch': the shipped weights; 'geometric': no learning) or a checkpoint's path (.safetensors).
+    """Load a matcher: 'rotmatch' (the shipped weights), 'geometric' (no learning) or a path (.safetensors).
 
     Raises
     ------

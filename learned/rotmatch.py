@@ -1,8 +1,9 @@
 """RotMatch: learned features of scan and map through rotated-template voting, the default network on a CPU.
 
-Two small U-Nets, one for the bird's-eye view of the scan and one for the picture of the map, give unit feature vectors a metre
-apart; the scan's also says how much each cell is worth. Voting turns them into a score for every pose. The principle is
-that of Barsan et al. (CoRL 2018) and of OrienterNet (Sarlin et al., CVPR 2023); sizes are chosen for two CPU cores.
+Two small U-Nets, one for the bird's-eye view of the scan and one for the picture of the map, give unit feature
+vectors a metre apart; the scan's also says how much each cell is worth. Voting turns them into a score for every
+pose. The principle is that of Barsan et al. (CoRL 2018) and of OrienterNet (Sarlin et al., CVPR 2023); sizes are
+chosen for two CPU cores.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
@@ -25,7 +27,7 @@ from fusion.likelihood import LikelihoodVolume
 from learned.bev import BANDS_M, BevSettings, bev_counts, log_density
 from learned.map_raster import MapRaster
 from learned.matcher import SearchRegion, matching_window
-from learned.voting import bin_yaws, vote, volume_from_scores, yaw_bins_within
+from learned.voting import bin_yaws, volume_from_scores, vote, yaw_bins_within
 
 ARCHITECTURE = "rotmatch-1"
 STRIDE = 2
@@ -33,7 +35,7 @@ STRIDE = 2
 
 @dataclass(frozen=True, slots=True)
 class RotMatchSettings:
-    """Sizes of the network: features a cell, widths of the U-Nets' levels (strides 2, 4, 8, 16), extent of the scan's image."""
+    """Sizes: features a cell, widths of the U-Nets' levels (strides 2, 4, 8, 16), extent of the scan's image."""
 
     channels: int = 8
     widths: tuple[int, int, int, int] = (16, 32, 48, 64)
@@ -41,7 +43,7 @@ class RotMatchSettings:
 
 
 class _Block(nn.Sequential):
-    """Convolution, group normalisation, ReLU. Kernels of even size keep a stride of 2 centred: turning commutes with it."""
+    """Convolution, group normalisation, ReLU. Even kernels keep a stride of 2 centred, so turning commutes with it."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
         super().__init__(
@@ -57,7 +59,7 @@ class FeatureNet(nn.Module):
     def __init__(self, inputs: int, outputs: int, widths: tuple[int, int, int, int]) -> None:
         super().__init__()
         self.stem = nn.Sequential(_Block(inputs, widths[0], kernel=6, stride=STRIDE), _Block(widths[0], widths[0]))
-        pairs = list(zip(widths[:-1], widths[1:], strict=True))
+        pairs = list(pairwise(widths))
         self.down = nn.ModuleList([nn.Sequential(_Block(a, b, kernel=4, stride=2), _Block(b, b)) for a, b in pairs])
         self.lateral = nn.ModuleList([nn.Conv2d(b, a, 1) for a, b in pairs])
         self.up = nn.ModuleList([_Block(a, a) for a, _ in pairs])
@@ -200,7 +202,7 @@ class RotMatch:
         return cls(net, calibration)
 
     def save(self, path: Path, provenance: dict[str, object]) -> None:
-        """Write PATH (.safetensors) and the .json beside it; `provenance` says what data, seed and command made them."""
+        """Write PATH (.safetensors) and the .json beside it; `provenance`: data, seed and command."""
         facts = {
             "architecture": ARCHITECTURE,
             "settings": asdict(self.net.settings),

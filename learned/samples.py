@@ -16,7 +16,14 @@ from learned.map_raster import CLASS_INDEX, CLASSES, PALETTE
 SAMPLE_METRES_PER_PIXEL = 0.5
 """Resolution of a sample's class raster and of its bird's-eye view."""
 
-_DROPPED_TOGETHER = (("wall", "fence", "hedge"), ("tree",), ("grass", "forest"), ("road",), ("path", "parking"), ("building",))
+_DROPPED_TOGETHER = (
+    ("wall", "fence", "hedge"),
+    ("tree",),
+    ("grass", "forest"),
+    ("road",),
+    ("path", "parking"),
+    ("building",),
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """Training RotMatch: a resumable loop over samples, with a loss curve and validation.
 
-Everything random comes from the seed and the step: stopping and resuming gives the weights that going on would have given.
+Everything random comes from the seed and the step: stopping and resuming gives the weights that going on would have
+given.
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ class _Batches(TorchDataset[list[Example]]):
 def batch_nll(
     net: RotMatchNet, examples: list[Example], quadrature: HeadingQuadrature, generator: torch.Generator
 ) -> Tensor:
-    """Mean negative log density of the true poses of a batch, per m^2 rad; the encoders run in bfloat16 while training."""
+    """Mean negative log density (per m^2 rad) of a batch's true poses; the encoders train in bfloat16."""
     density = torch.from_numpy(np.stack([example.density for example in examples]))
     pictures = torch.stack([picture_tensor(example.picture) for example in examples])
     with torch.autocast("cpu", torch.bfloat16, enabled=net.training):
@@ -122,9 +123,7 @@ def batch_nll(
 
 def validation_nll(net: RotMatchNet, source: SampleSource, settings: TrainingSettings) -> float:
     """Mean NLL over all samples of a source, without impoverishment, at offsets that are always the same."""
-    plain = Augmentation(
-        settings.augmentation.max_offset_px, settings.augmentation.crop_px, 0.0, 0.0, 0.0, 0.0, 0.0
-    )
+    plain = Augmentation(settings.augmentation.max_offset_px, settings.augmentation.crop_px, 0.0, 0.0, 0.0, 0.0, 0.0)
     generator = torch.Generator().manual_seed(settings.seed)
     net.eval()
     losses = []

@@ -1,23 +1,22 @@
 """Rotated-template voting: score every pose of a window by correlating a scan's features with the map's.
 
-A scan's feature image, seen from above with the vehicle at its centre, is rotated to each candidate heading and correlated with
-the map's feature image; the correlation at a shift is the score of the pose that the shift stands for. It is exhaustive over
-position and heading, differentiable, and costs one FFT a channel and heading (OrienterNet, Sarlin et al., CVPR 2023, section 3.3,
-uses the same principle; Barsan et al., CoRL 2018, equation 3, is its origin).
+A scan's feature image, seen from above with the vehicle at its centre, is rotated to each candidate heading and
+correlated with the map's feature image; the correlation at a shift is the score of the pose that the shift stands
+for. It is exhaustive over position and heading, differentiable, and costs one FFT a channel and heading (OrienterNet,
+Sarlin et al., CVPR 2023, section 3.3, uses the same principle; Barsan et al., CoRL 2018, equation 3, is its origin).
 
-The vehicle stands on the corner between the template's four middle pixels, so candidate positions are pixel corners of the map
-window, and the grid of the scores is half a pixel off the map's.
+The vehicle stands on the corner between the template's four middle pixels, so candidate positions are pixel corners
+of the map window, and the grid of the scores is half a pixel off the map's.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import FunctionCtx
 
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
@@ -62,10 +61,9 @@ def correlate(map_features: Tensor, templates: Tensor) -> Tensor:
     templates
         (R, C, h, w) with h <= H and w <= W.
 
-    Returns
-    -------
-    (R, H - h + 1, W - w + 1): sum over channels and pixels of map[c, r + i, q + j] * template[c, i, j].
-    No shift wraps around: only shifts that keep the template inside are returned, so the map's own size is padding enough.
+    Returns ------- (R, H - h + 1, W - w + 1): sum over channels and pixels of map[c, r + i, q + j] * template[c, i,
+    j]. No shift wraps around: only shifts that keep the template inside are returned, so the map's own size is
+    padding enough.
     """
     height, width = map_features.shape[-2:]
     rows, cols = height - templates.shape[-2] + 1, width - templates.shape[-1] + 1
@@ -78,10 +76,10 @@ def correlate(map_features: Tensor, templates: Tensor) -> Tensor:
 
 
 class _Correlation(torch.autograd.Function):
-    """Correlation by real FFTs, with a backward pass by real FFTs too (autograd's own takes complex ones of full size)."""
+    """Correlation by real FFTs, backwards too (autograd's own backward takes complex ones of full size)."""
 
     @staticmethod
-    def forward(ctx: FunctionCtx, map_features: Tensor, templates: Tensor) -> Tensor:
+    def forward(ctx: Any, map_features: Tensor, templates: Tensor) -> Tensor:
         height, width = map_features.shape[-2:]
         map_spectrum = torch.fft.rfft2(map_features)
         spectra = torch.fft.rfft2(templates, s=(height, width))
@@ -92,7 +90,7 @@ class _Correlation(torch.autograd.Function):
         return scores[:, :rows, :cols].contiguous()
 
     @staticmethod
-    def backward(ctx: FunctionCtx, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
         map_spectrum, spectra = ctx.saved_tensors
         size, (rows, cols) = ctx.shapes
         gradient = torch.fft.rfft2(gradients[0], s=size)[:, None]
@@ -102,7 +100,7 @@ class _Correlation(torch.autograd.Function):
 
 
 def vote(map_features: Tensor, scan_features: Tensor, yaws: Tensor, chunk: int = 16) -> Tensor:
-    """Score (R, rows, cols) of each heading in `yaws` (R,) and each position; `chunk` headings at a time bound the memory."""
+    """Score (R, rows, cols) of headings `yaws` (R,) and all positions; `chunk` headings at a time bound the memory."""
     blocks = [correlate(map_features, rotate_templates(scan_features, block)) for block in yaws.split(chunk)]
     return torch.cat(blocks)
 

@@ -1,1 +1,1 @@
-"""Drives, where they come from and what is done with them: readers, simulation, tracking, evaluation, the command line."""
+"""Drives: where they come from and what is done with them, from readers and simulation to the command line."""

@@ -37,8 +37,8 @@ class Measurement:
     temperature: float
 
     def modes(self, k: int) -> GaussianMixture:
-        """The at most `k` strongest modes of the flattened likelihood, for the smoother."""
-        return self.likelihood.tempered(self.temperature).modes(k)
+        """The at most `k` strongest modes of the likelihood, flattened by the temperature, for the smoother."""
+        return self.likelihood.modes(k).tempered(self.temperature)
 
     def best_pose(self) -> FloatArray:
         """The matcher's own answer (3,): the highest cell, refined below the cell by the mean over its neighbours."""

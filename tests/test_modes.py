@@ -191,3 +191,29 @@ def test_circular_run_is_the_shortest_arc_over_all_hits(mask):
     hits = np.flatnonzero(mask)
     shortest = min(int(((hits - start) % len(mask)).max()) + 1 for start in hits)
     assert len(run) == shortest
+
+
+def test_a_tempered_gaussian_is_its_power() -> None:
+    """One component: N^(1/T) normalised is N with T times the covariance, and tempering twice multiplies."""
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(3, 3)) * [0.8, 0.5, 0.05]
+    single = GaussianMixture(np.array([0.9]), rng.normal(size=(1, 3)), (root.T @ root + 1e-4 * np.eye(3))[None])
+    poses = single.means[0] + 0.05 * rng.normal(size=(50, 3))
+    power = single.log_density(poses) / 4.0
+    flat = single.tempered(4.0)
+    np.testing.assert_allclose(np.diff(flat.log_density(poses)), np.diff(power), atol=1e-9)
+    np.testing.assert_allclose(flat.weights, 0.9)
+    np.testing.assert_allclose(single.tempered(2.0).tempered(2.0).covariances, flat.covariances)
+
+
+def test_tempering_brings_separate_components_closer_by_the_power() -> None:
+    """Far apart, the density at each peak is that of the mixture to the power 1/T, up to one factor for all."""
+    means = np.array([[0.0, 0.0, 0.0], [500.0, 0.0, 1.0], [0.0, 500.0, -2.0]])
+    covariances = np.array([np.diag([s, 2 * s, 0.01]) for s in (0.5, 1.0, 3.0)])
+    mixture = GaussianMixture(np.array([0.1, 0.6, 0.2]), means, covariances)
+    flat = mixture.tempered(3.0)
+    assert flat.weights.sum() == pytest.approx(0.9)
+    assert (np.diff(flat.weights) <= 0).all()
+    np.testing.assert_allclose(np.diff(flat.log_density(means)), np.diff(mixture.log_density(means)) / 3.0, atol=1e-9)
+    with pytest.raises(SkyfixError, match="temperature"):
+        mixture.tempered(0.0)

@@ -62,7 +62,9 @@ def test_augmentation_moves_truth_scan_and_map_together(seed: int) -> None:
     side = example.col + (math.cos(example.yaw) * ahead - math.sin(example.yaw) * left)
     seen = (top > 4) & (top < 252) & (side > 4) & (side < 252)
     walls = (example.picture == example.picture.max(axis=(0, 1))).all(axis=-1)
-    near = np.array([walls[int(t) - 3 : int(t) + 4, int(s) - 3 : int(s) + 4].any() for t, s in zip(top, side, strict=True)])
+    near = np.array(
+        [walls[int(t) - 3 : int(t) + 4, int(s) - 3 : int(s) + 4].any() for t, s in zip(top, side, strict=True)]
+    )
     assert seen.sum() > 50
     assert near[seen].mean() > 0.99
 
@@ -93,15 +95,15 @@ TINY = TrainingSettings(
 def test_resuming_gives_the_weights_that_going_on_would_have_given(tmp_path: Path) -> None:
     source, held_out = Landmarks(4), Landmarks(1)
 
-    class Stop(Exception):
+    class StopEarlyError(Exception):
         pass
 
     def stop_at_four(step: int, steps: int, loss: float, validation: float | None) -> None:
         if step == 4:
-            raise Stop
+            raise StopEarlyError
 
     straight = train(source, held_out, TINY, tmp_path / "straight")
-    with pytest.raises(Stop):
+    with pytest.raises(StopEarlyError):
         train(source, held_out, TINY, tmp_path / "resumed", stop_at_four)
     resumed = train(source, held_out, TINY, tmp_path / "resumed")
     for a, b in zip(straight.parameters(), resumed.parameters(), strict=True):
