@@ -28,7 +28,7 @@ class Measurement:
     likelihood
         As the matcher gave it.
     temperature
-        By which the filter and the smoother flatten it.
+        By which the filter and the smoother flatten it, for errors shared with the measurement before.
     """
 
     points: Float32Array

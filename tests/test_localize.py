@@ -354,3 +354,23 @@ def test_a_run_that_cannot_be_written_leaves_nothing(
     with pytest.raises(SkyfixError, match="cannot be written: No space left on device"):
         write_run(run(made_drive), tmp_path / "runs" / "one")
     assert list((tmp_path / "runs").iterdir()) == []
+
+
+def test_modes_for_the_smoother_are_flattened_one_by_one() -> None:
+    grid = MapGrid(80, 80, 0.5, -20.0, -20.0)
+    x, y = grid.centres()
+    bins = np.arange(120) * 2.0 * np.pi / 120
+
+    def bump(at_x: float, weight: float) -> np.ndarray:
+        squared = ((x[None, :, None] - at_x) ** 2 + y[:, None, None] ** 2) / 0.8**2 + (se2.wrap(bins) / 0.1) ** 2
+        return weight * np.exp(-0.5 * squared)
+
+    volume = LikelihoodVolume.from_scores(np.log(bump(-8.0, 0.9) + bump(8.0, 0.1) + 1e-12), grid)
+    search = first_search(UniformPrior(np.zeros(3), 10.0, np.pi), SETTINGS)
+    scan = np.zeros((1, 4), np.float32)
+    sharp, flat = (Measurement(scan, search, volume, temperature).modes(5) for temperature in (1.0, 4.0))
+    np.testing.assert_allclose(sharp.weights, [0.9, 0.1], atol=0.01)
+    np.testing.assert_allclose(flat.means, sharp.means)
+    np.testing.assert_allclose(flat.covariances, 4.0 * sharp.covariances)
+    assert flat.weights.sum() == pytest.approx(sharp.weights.sum())
+    assert flat.weights[0] / flat.weights[1] == pytest.approx(9.0**0.25, rel=0.01)
