@@ -77,7 +77,9 @@ def demo(
     "`skyfix track drives/mine --start 12.5 -80 90 --half-extent 30 --heading-unknown --out runs/mine`"
 )
 def track(
-    sequence: Annotated[Path, typer.Argument(help="Folder with map.json, odometry/*.tum, scans/ (see the README).")],
+    sequence: Annotated[
+        Path, typer.Argument(help="Folder with map.json, odometry/*.tum, scans/ (see the README).", metavar="SEQUENCE")
+    ],
     odometry: Annotated[
         str | None,
         typer.Option(help="One of SEQUENCE/odometry/*.tum. Default: the first that is not emulated.", metavar="NAME"),
@@ -102,7 +104,14 @@ def track(
     measure_every_frames: Annotated[
         int | None, typer.Option(help="Match every so many frames instead.", metavar="N")
     ] = None,
-    particles: Annotated[int, typer.Option(help="Number of particles.", metavar="N")] = 10_000,
+    correlation_length_m: Annotated[
+        float | None,
+        typer.Option(help="How far the matcher's errors stay alike, metres. Default: the matcher's own.", metavar="M"),
+    ] = None,
+    map_error_m: Annotated[
+        float, typer.Option(help="How far off the map draws things, standard deviation, metres.", metavar="M")
+    ] = 0.4,
+    particles: Annotated[int, typer.Option(help="How many particles the filter has.", metavar="N")] = 10_000,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -123,13 +132,15 @@ def track(
         start=start,
         measure_every_m=measure_every_m,
         measure_every_frames=measure_every_frames,
+        correlation_length_m=correlation_length_m,
+        map_error_m=map_error_m,
     )
     _run(opened, matcher, settings, out, overwrite, quiet)
 
 
 @app.command(epilog="Example: `skyfix evaluate drives/kitti_13 drives/kitti_360 --matcher geometric --json shots.json`")
 def evaluate(
-    sequences: Annotated[list[Path], typer.Argument(help="Sequence folders with ground truth.", metavar="SEQUENCE...")],
+    sequences: Annotated[list[Path], typer.Argument(help="Sequence folders with ground truth.", metavar="SEQUENCE")],
     matcher: Annotated[
         list[str] | None,
         typer.Option(
@@ -166,7 +177,7 @@ def evaluate(
 
 @app.command(epilog="Example: `skyfix train rotmatch.yaml --data osm --out runs/training`")
 def train(
-    config: Annotated[Path, typer.Argument(help="YAML file with the training's settings.")],
+    config: Annotated[Path, typer.Argument(help="YAML file with the training's settings.", metavar="CONFIG")],
     data: Annotated[Path, typer.Option(help="Folder of the OpenStreetMap extracts.", metavar="DIR")] = Path(),
     out: Annotated[Path, typer.Option(help="Gets the checkpoint, the loss curve and the cache.", metavar="DIR")] = Path(
         "runs/training"
@@ -179,7 +190,7 @@ def train(
 
 
 @app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")
-def view(run: Annotated[Path, typer.Argument(help="Run directory.")]) -> None:
+def view(run: Annotated[Path, typer.Argument(help="Run directory.", metavar="RUN")]) -> None:
     """Print the table of a run again, and where its report is."""
     from sequences.run_files import read_metrics
 
@@ -249,11 +260,8 @@ def main() -> None:
     try:
         app()
     except SkyfixError as error:
-        print(f"skyfix: error: {error}", file=sys.stderr)
+        print(f"skyfix: error: {' '.join(str(error).split())}", file=sys.stderr)
         raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        print("skyfix: interrupted", file=sys.stderr)
-        raise SystemExit(130) from None
 
 
 if __name__ == "__main__":

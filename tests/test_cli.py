@@ -12,9 +12,12 @@ import pytest
 from made_drive import EmulatedMatcher, MadeDrive, write_made_drive
 
 import learned.matcher
+import sequences.localize
+from fusion.errors import SkyfixError
 from sequences.cli import app, default_odometry, main
 from sequences.folder import FolderSequence
 from sequences.tables import ROWS
+from sequences.track_settings import TrackSettings
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,47 @@ def test_metrics_have_what_other_programs_read(tracked: TrackedRun) -> None:
     assert set(metrics["seconds_per_frame"]) == {"scan", "match", "predict", "update", "smooth"}
     assert metrics["realtime_factor"] > 0.0
     assert (metrics["scans_simulated"], metrics["odometry_emulated"], metrics["skipped_frames"]) == (False, False, 0)
+
+
+def test_every_option_of_track_reaches_the_settings(
+    made_drive: MadeDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[TrackSettings] = []
+
+    def stop(sequence: object, matcher: object, settings: TrackSettings, progress: object) -> None:
+        seen.append(settings)
+        raise SkyfixError("seen")
+
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(made_drive.truth.poses))
+    monkeypatch.setattr(sequences.localize, "track", stop)
+    options = {
+        "--odometry": "wheels",
+        "--start": "-22.5 -12 -20",
+        "--seed": "9",
+        "--half-extent": "31",
+        "--measure-every-m": "7.5",
+        "--measure-every-frames": "3",
+        "--correlation-length-m": "11",
+        "--map-error-m": "0.25",
+        "--particles": "1234",
+    }
+    words = [word for option, value in options.items() for word in (option, *value.split())]
+    out = ("--out", str(tmp_path / "out"))
+    assert skyfix(capsys, monkeypatch, "track", str(made_drive.path), *out, *words, "--heading-unknown").code == 2
+    assert seen == [
+        TrackSettings(
+            odometry="wheels",
+            seed=9,
+            particles=1234,
+            half_extent_m=31.0,
+            half_heading_deg=180.0,
+            start=(-22.5, -12.0, -20.0),
+            measure_every_m=7.5,
+            measure_every_frames=3,
+            correlation_length_m=11.0,
+            map_error_m=0.25,
+        )
+    ]
 
 
 def test_view_prints_the_same_table_again(
