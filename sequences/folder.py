@@ -107,12 +107,15 @@ class FolderSequence:
 
     def _recorded_stamps(self) -> NDArray[np.int64]:
         stamps = read_times(self._path / "scans" / "times.txt")
+        found = sum(1 for _ in (self._path / "scans").glob("*.bin"))
         missing = [index for index in range(len(stamps)) if not self._scan_file(index).exists()]
         if missing:
             raise SkyfixError(
                 f"scans: expected {len(stamps)} files, one a line of times.txt, but {self._scan_file(missing[0]).name} "
                 f"is missing ({len(missing)} in all)"
             )
+        if found > len(stamps):
+            raise SkyfixError(f"scans: expected {len(stamps)} files, one a line of times.txt, got {found}")
         return stamps
 
     def _simulated_stamps(self) -> NDArray[np.int64]:

@@ -93,6 +93,10 @@ SPOILS: dict[str, tuple[Spoil, str]] = {
     "times go back": (lambda made: swap(times(made), 2, 3), "times.txt: line 4: stamps must increase"),
     "no times": (lambda made: times(made).unlink(), "times.txt: cannot be read: No such file"),
     "a scan missing": (lambda made: made.scan_file(11).unlink(), "000011.bin is missing (1 in all)"),
+    "more scans than times": (
+        lambda made: made_scan(30).tofile(made.scan_file(30)),
+        "scans: expected 30 files, one a line of times.txt, got 31",
+    ),
     "first scan too short": (
         lambda made: made.scan_file(0).write_bytes(bytes(50)),
         "scan 000000.bin: expected a multiple of 16 bytes (float32 x, y, z, reflectance), got 50",

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 from made_drive import EmulatedMatcher, MadeDrive, write_made_drive
+from rich.console import Console
 
 import learned.matcher
+import sequences.demo
 import sequences.localize
+import sequences.progress
+import sequences.train_command
 from fusion.errors import SkyfixError
 from sequences.cli import app, default_odometry, main
 from sequences.folder import FolderSequence
+from sequences.progress import ConsoleProgress
+from sequences.run_result import FrameRow
 from sequences.tables import ROWS
 from sequences.track_settings import TrackSettings
 
@@ -191,6 +200,59 @@ def test_evaluate_prints_the_prior_beside_every_matcher(
     assert mean["sharp"] < 0.6 < mean["blunt"] < mean["prior"]
     assert evaluation["methods"]["prior"]["frames"] == 14
     assert done.out == skyfix(capsys, monkeypatch, *arguments, "--max-frames", "15").out
+
+
+def test_demo_tracks_the_demo_sequence(
+    made_drive: MadeDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[str, int]] = []
+
+    def stop(sequence: FolderSequence, matcher: object, settings: TrackSettings, progress: object) -> None:
+        seen.append((sequence.name, settings.seed))
+        raise SkyfixError("seen")
+
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(made_drive.truth.poses))
+    monkeypatch.setattr(sequences.demo, "DemoSequence", lambda seed: FolderSequence(made_drive.path, seed))
+    monkeypatch.setattr(sequences.localize, "track", stop)
+    assert skyfix(capsys, monkeypatch, "demo", "--seed", "4", "--out", str(tmp_path / "out")).code == 2
+    assert seen == [("made_drive", 4)]
+
+
+def test_train_is_handed_its_files_and_shows_its_steps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(config: Path, data: Path, out: Path, progress: Callable[[int, int, float, float | None], None]) -> Path:
+        assert (config, data, out) == (Path("net.yaml"), Path("osm"), tmp_path)
+        for step in range(1, 121):
+            progress(step, 120, 1.5, None if step < 100 else 2.25)
+        return out / "rotmatch.safetensors"
+
+    monkeypatch.setattr(sequences.train_command, "train_from_config", train)
+    done = skyfix(capsys, monkeypatch, "train", "net.yaml", "--data", "osm", "--out", str(tmp_path))
+    assert done.code == 0
+    assert done.out == f"checkpoint: {tmp_path / 'rotmatch.safetensors'}\n"
+    steps = ["step 50/120: loss 1.500", "step 100/120: loss 1.500, validation 2.250"]
+    assert done.err.splitlines() == [*steps, "step 120/120: loss 1.500, validation 2.250"]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_says_how_far_how_fast_and_how_well(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(np.arange(0.0, 1000.0, 6.0))  # seconds, 6 a look: a line every other frame
+    monkeypatch.setattr(sequences.progress.time, "perf_counter", lambda: next(clock))
+    written = io.StringIO()
+    console = Console(file=written, force_terminal=terminal, width=120)
+    row = FrameRow(0, 0, False, "", None, 1.0, 0.0, None, None, None, {})
+    with ConsoleProgress(console, "my_drive") as progress:
+        progress.start(4)
+        for error_m in (1.0, 2.0, 3.0, 4.0):
+            progress.frame(row, error_m)
+    if terminal:
+        assert "my_drive" in written.getvalue()
+    else:
+        lines = written.getvalue().splitlines()
+        assert len(lines) == 2
+        assert lines[0].startswith("my_drive: 2/4 frames, ")
+        assert lines[0].endswith(" frames/s, error 2.00 m (mean 1.50 m)")
 
 
 def test_odometry_that_is_not_emulated_is_preferred(made_drive: MadeDrive) -> None:

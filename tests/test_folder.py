@@ -92,6 +92,8 @@ def test_truth_may_be_denser_than_the_scans(made_drive: MadeDrive) -> None:
     keep = np.arange(0, len(made_drive.truth), 3)
     lines = (made_drive.path / "scans" / "times.txt").read_text().splitlines()
     (made_drive.path / "scans" / "times.txt").write_text("\n".join(lines[index] for index in keep) + "\n")
+    for index in range(len(keep), len(made_drive.truth)):
+        made_drive.scan_file(index).unlink()
     sequence = FolderSequence(made_drive.path)
     assert sequence.ground_truth is not None
     assert len(sequence.stamps_ns) == len(keep)
