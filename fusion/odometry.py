@@ -67,6 +67,9 @@ class OdometryNoise:
         Standard deviation of the position along and across the motion after one metre.
     heading_rad_per_sqrt_m : float
         Standard deviation of the heading after one metre.
+    heading_rad_per_sqrt_rad : float
+        Standard deviation of the heading after a turn by one radian: scale errors of a gyroscope, stamps that are a
+        little off, a heading that lags.
     position_m_per_sqrt_s, heading_rad_per_sqrt_s : float
         The same after one second, whatever the motion: what is not known even at standstill.
 
@@ -79,6 +82,7 @@ class OdometryNoise:
     longitudinal_m_per_sqrt_m: float = 0.05
     lateral_m_per_sqrt_m: float = 0.03
     heading_rad_per_sqrt_m: float = 0.002
+    heading_rad_per_sqrt_rad: float = 0.06
     position_m_per_sqrt_s: float = 0.02
     heading_rad_per_sqrt_s: float = 0.001
 
@@ -90,9 +94,10 @@ class OdometryNoise:
 
     def covariance(self, delta: ArrayLike, seconds: float = 0.0) -> FloatArray:
         """Covariance (3, 3) of the increment `delta` (3,) that took `seconds`."""
-        x, y, _ = checked("delta", delta, (3,))
+        x, y, turned = checked("delta", delta, (3,))
         distance = float(np.hypot(x, y))
         heading = self.heading_rad_per_sqrt_m**2 * distance + self.heading_rad_per_sqrt_s**2 * seconds
+        heading += self.heading_rad_per_sqrt_rad**2 * abs(turned)
         position = self.position_m_per_sqrt_s**2 * seconds
         along = self.longitudinal_m_per_sqrt_m**2 * distance + position
         across = self.lateral_m_per_sqrt_m**2 * distance + position + heading * distance**2 / 3.0

@@ -77,12 +77,16 @@ def test_accumulated_covariance_is_that_of_simulated_drives():
 
 
 def test_noise_grows_along_and_across_the_motion():
-    ahead = OdometryNoise(0.1, 0.02, 0.0, 0.0, 0.0).covariance([9.0, 0.0, 0.0])
+    moving = OdometryNoise(0.1, 0.02, 0.0, 0.0, 0.0, 0.0)
+    ahead = moving.covariance([9.0, 0.0, 0.0])
     np.testing.assert_allclose(np.sqrt(np.diag(ahead)), [0.3, 0.06, 0.0])
-    left = OdometryNoise(0.1, 0.02, 0.0, 0.0, 0.0).covariance([0.0, 9.0, 0.0])
+    left = moving.covariance([0.0, 9.0, 0.0])
     np.testing.assert_allclose(np.sqrt(np.diag(left)), [0.06, 0.3, 0.0])
-    still = OdometryNoise(0.1, 0.1, 0.1, 0.02, 0.003).covariance(np.zeros(3), seconds=4.0)
+    still = OdometryNoise(0.1, 0.1, 0.1, 0.1, 0.02, 0.003).covariance(np.zeros(3), seconds=4.0)
     np.testing.assert_allclose(np.sqrt(np.diag(still)), [0.04, 0.04, 0.006])
+    turning = OdometryNoise(0.0, 0.0, 0.0, 0.05, 0.0, 0.0)
+    for turn in (-1.44, 1.44):
+        np.testing.assert_allclose(np.sqrt(np.diag(turning.covariance([0.0, 0.0, turn]))), [0.0, 0.0, 0.06])
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(-4, 4), st.floats(0, 10))
