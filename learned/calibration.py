@@ -39,8 +39,10 @@ def match_samples(
 ) -> tuple[list[LikelihoodVolume], NDArray[np.float64]]:
     """Match samples within boxes that lie about the truth at seeded uniform offsets.
 
-    Returns ------- The volumes, and the true poses (N, 3), each in the frame of its sample's class raster (origin at
-    its lower left corner).
+    Returns
+    -------
+    The volumes, and the true poses (N, 3), each in the frame of its sample's class raster (origin at its lower left
+    corner).
     """
     rng = np.random.default_rng(seed)
     half = np.array([half_extent_m, half_extent_m, half_heading_rad])

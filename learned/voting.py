@@ -61,9 +61,10 @@ def correlate(map_features: Tensor, templates: Tensor) -> Tensor:
     templates
         (R, C, h, w) with h <= H and w <= W.
 
-    Returns ------- (R, H - h + 1, W - w + 1): sum over channels and pixels of map[c, r + i, q + j] * template[c, i,
-    j]. No shift wraps around: only shifts that keep the template inside are returned, so the map's own size is
-    padding enough.
+    Returns
+    -------
+    (R, H - h + 1, W - w + 1): sum over channels and pixels of map[c, r + i, q + j] * template[c, i, j]. No shift
+    wraps around: only shifts that keep the template inside are returned, so the map's own size is padding enough.
     """
     height, width = map_features.shape[-2:]
     rows, cols = height - templates.shape[-2] + 1, width - templates.shape[-1] + 1

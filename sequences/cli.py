@@ -138,7 +138,7 @@ def track(
     _run(opened, matcher, settings, out, overwrite, quiet)
 
 
-@app.command(epilog="Example: `skyfix evaluate drives/kitti_13 drives/kitti_360 --matcher geometric --json shots.json`")
+@app.command(epilog="Example: `skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`")
 def evaluate(
     sequences: Annotated[list[Path], typer.Argument(help="Sequence folders with ground truth.", metavar="SEQUENCE")],
     matcher: Annotated[
@@ -158,13 +158,21 @@ def evaluate(
 ) -> None:
     """Score single shots: each scan by itself from a start that is off, beside the prior's own score."""
     from learned.matcher import load_matcher
+    from sequences.demo import DemoSequence
     from sequences.evaluate import evaluate_single_shot, markdown_table
     from sequences.folder import FolderSequence
 
     half_heading = 180.0 if heading_unknown else half_heading_deg
     loaded = {name: load_matcher(name) for name in matcher or ["rotmatch", "geometric"]}
     evaluations = [
-        evaluate_single_shot(FolderSequence(path, seed), loaded, half_extent, half_heading, max_frames, seed)
+        evaluate_single_shot(
+            DemoSequence(seed) if path == Path("demo") else FolderSequence(path, seed),
+            loaded,
+            half_extent,
+            half_heading,
+            max_frames,
+            seed,
+        )
         for path in sequences
     ]
     typer.echo(markdown_table(evaluations), nl=False)

@@ -51,7 +51,8 @@ def evaluate_single_shot(
         Of the offsets.
 
     Returns
-    ------- `sequence`, `scans_simulated`, `start` and `methods`: {"prior" or a matcher's key: an object as
+    -------
+    `sequence`, `scans_simulated`, `start` and `methods`: {"prior" or a matcher's key: an object as
     `metrics.summarise` makes it}.
 
     Raises
@@ -94,12 +95,14 @@ def evaluate_single_shot(
 
 def markdown_table(evaluations: list[dict[str, Any]]) -> str:
     """Evaluations as one Markdown table, a line a sequence and method."""
-    header = ["sequence", "method", "frames", *ERROR_COLUMNS]
+    header = ["sequence", "method", "frames", *ERROR_COLUMNS, "within 5 m"]
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     for evaluation in evaluations:
         label = evaluation["sequence"] + (" (scans simulated)" if evaluation["scans_simulated"] else "")
         for name, summary in evaluation["methods"].items():
-            lines.append("| " + " | ".join([label, name, str(summary["frames"]), *error_cells(summary)]) + " |")
+            within = f"{100 * summary['position_recall']['5']:.0f} %"
+            cells = [label, name, str(summary["frames"]), *error_cells(summary), within]
+            lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 

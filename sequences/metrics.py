@@ -75,11 +75,10 @@ def summarise(
     covariances
         (N, 3, 3) of (x, y, yaw) on the axes of the map; adds `nees` and `ellipse95`.
 
-    Returns
-    ------- `position_error_m`, `heading_error_deg`, `lateral_recall`, `longitudinal_recall`, `heading_recall`
-    (fractions of frames below 1, 3, 5 metres or degrees), `frames`; with covariances also `nees` = {mean, dof: 3,
-    coverage95} of (x, y, yaw) and `ellipse95`, the fraction of frames with the true position in the 95 % ellipse (2
-    degrees of freedom).
+    Returns ------- `position_error_m`, `heading_error_deg`, `position_recall`, `lateral_recall`,
+    `longitudinal_recall`, `heading_recall` (fractions of frames below 1, 3, 5 metres or degrees), `frames`; with
+    covariances also `nees` = {mean, dof: 3, coverage95} of (x, y, yaw) and `ellipse95`, the fraction of frames with
+    the true position in the 95 % ellipse (2 degrees of freedom).
     """
     if len(truth) == 0:
         raise SkyfixError("metrics: expected at least one frame, got none")
@@ -98,6 +97,7 @@ def summarise(
             "median": _rounded(np.median(heading_deg)),
             "max": _rounded(heading_deg.max()),
         },
+        "position_recall": _recall(position),
         "lateral_recall": _recall(np.abs(lateral)),
         "longitudinal_recall": _recall(np.abs(longitudinal)),
         "heading_recall": _recall(heading_deg),
@@ -126,9 +126,10 @@ def drift(truth: Trajectory, smoother: Trajectory, odometry: Trajectory) -> dict
     """Whether errors grow along the drive.
 
     Returns
-    ------- The smoother's mean position error over the first and over the last quarter of the true path length, and
-    the position error of the odometry at the last frame when it is started at the true first pose: its drift, free of
-    any error of the start.
+    -------
+    The smoother's mean position error over the first and over the last quarter of the true path length, and the
+    position error of the odometry at the last frame when it is started at the true first pose: its drift, free of any
+    error of the start.
     """
     errors = position_errors(truth.poses, smoother.poses)
     along = distance_along(truth.poses)

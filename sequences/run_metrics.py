@@ -29,9 +29,10 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
         Time that the smoother took over the whole drive.
 
     Returns
-    ------- The methods `prior`, `odometry`, `single_shot` (measured frames only), `filter`,
-    `filter_after_first_quarter` (of the way) and `smoother`, as `metrics.summarise` describes them, and `drift`; none
-    of these without ground truth. Always: what was run, and `seconds_per_frame` by stage, averaged over all frames.
+    -------
+    The methods `prior`, `odometry`, `single_shot` (measured frames only), `filter`, `filter_after_first_quarter` (of
+    the way) and `smoother`, as `metrics.summarise` describes them, and `drift`; none of these without ground truth.
+    Always: what was run, and `seconds_per_frame` by stage, averaged over all frames.
     """
     methods = {} if result.truth is None else _methods(result, result.truth)
     rows = result.frame_rows
