@@ -1,10 +1,10 @@
-# make setup | demo | test | lint | format | clean          (PYTHON=python3.12 make setup takes another interpreter)
+# make setup | demo | test | benchmark | lint | format | clean          (PYTHON=python3.12 make setup takes another interpreter)
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test lint format clean
+.PHONY: setup demo test benchmark lint format clean
 
 setup: $(READY)
 
@@ -22,6 +22,9 @@ demo: setup
 test: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
+benchmark: setup
+	OMP_NUM_THREADS=1 $(BIN)/skyfix benchmark
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -33,4 +36,4 @@ format: setup
 
 clean:
 	rm -rf build dist runs *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
-	find fusion learned sequences tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find benchmarks fusion learned sequences tests -name __pycache__ -type d -prune -exec rm -rf {} +

