@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from filterpy.stats import NEES
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -54,6 +55,15 @@ def test_nees_of_honest_errors_is_their_dimension():
     assert coverage(values, 3) == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / 4000))
     assert coverage(4.0 * values, 3) < 0.7  # standard deviations stated half as large as they are
     assert coverage(values, 3, level=0.5) == pytest.approx(0.5, abs=0.035)
+
+
+@pytest.mark.parametrize("dof", [1, 2, 3, 6])
+def test_nees_is_filterpy_s(dof):
+    rng = np.random.default_rng(dof)
+    truth, estimate = rng.normal(size=(2, 200, dof))
+    roots = rng.normal(size=(200, dof, dof)) + 3 * np.eye(dof)
+    covariances = roots @ roots.swapaxes(1, 2)
+    np.testing.assert_allclose(nees(estimate - truth, covariances), NEES(truth, estimate, covariances), rtol=1e-6)
 
 
 def test_nees_does_not_care_about_the_axes():

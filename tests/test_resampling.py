@@ -1,5 +1,6 @@
 """Resampling: unbiased, exact in number, and safe with the weights that filters really have."""
 
+import filterpy.monte_carlo.resampling
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -51,6 +52,35 @@ def test_systematic_gives_every_particle_its_share_rounded(weights, n, seed):
     share = n * weights / weights.sum()
     assert (counts >= np.floor(share - 1e-6)).all()
     assert (counts <= np.ceil(share + 1e-6)).all()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_systematic_is_filterpy_s_for_the_same_offset(seed, monkeypatch):
+    offset = np.random.default_rng(seed).random()
+    monkeypatch.setattr(filterpy.monte_carlo.resampling, "random", lambda: offset)
+    weights = np.random.default_rng(100 + seed).dirichlet(np.full(500, 0.2))
+    expected = filterpy.monte_carlo.systematic_resample(weights)
+    np.testing.assert_array_equal(systematic(weights, 500, np.random.default_rng(seed)), expected)
+
+
+class LastOffset(np.random.Generator):
+    """Draws the largest number below 1."""
+
+    def __init__(self):
+        super().__init__(np.random.PCG64(0))
+
+    def random(self):
+        return np.nextafter(1.0, 0.0)
+
+
+def test_systematic_holds_where_filterpy_s_runs_off_the_end(monkeypatch):
+    weights = np.random.default_rng(5).dirichlet(np.ones(10)) * (1 - 1e-9)
+    monkeypatch.setattr(filterpy.monte_carlo.resampling, "random", LastOffset().random)
+    with pytest.raises(IndexError):
+        filterpy.monte_carlo.systematic_resample(weights)
+    counts = np.bincount(systematic(weights, 10, LastOffset()), minlength=10)
+    assert counts.sum() == 10
+    assert (np.abs(counts - 10 * weights) < 1.0).all()
 
 
 @every_scheme
