@@ -121,29 +121,36 @@ class ParticleFilter:
     Parameters
     ----------
     particles : (N, 3) array_like
-        First cloud, equally weighted.
+        First cloud.
     seed : int or numpy Generator
         Source of all randomness; the same seed gives the same run.
     settings : ParticleFilterSettings
         How the filter behaves.
+    log_weights : (N,) array_like, optional
+        Of the first cloud, up to a constant; equal when left out.
 
     Raises
     ------
     SkyfixError
-        When there is no particle or one is not finite.
+        When there is no particle, or one of them or of the weights is not finite.
     """
 
     def __init__(
-        self, particles: ArrayLike, seed: int | np.random.Generator, settings: ParticleFilterSettings | None = None
+        self,
+        particles: ArrayLike,
+        seed: int | np.random.Generator,
+        settings: ParticleFilterSettings | None = None,
+        log_weights: ArrayLike | None = None,
     ) -> None:
         cloud = checked("particles", particles, ("N", 3)).copy()
         if len(cloud) == 0:
             raise SkyfixError("particles: expected at least one, got none")
+        weights = np.zeros(len(cloud)) if log_weights is None else checked("log weights", log_weights, (len(cloud),))
         cloud[:, 2] = se2.wrap(cloud[:, 2])
         self.settings = settings or ParticleFilterSettings()
         self._rng = np.random.default_rng(seed)
         self._particles = cloud
-        self._log_weights = np.full(len(cloud), -np.log(len(cloud)))
+        self._log_weights = weights - logsumexp(weights)
         self._log_evidence = 0.0
         self._lost = self.settings.kidnap_probability
 

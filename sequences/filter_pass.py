@@ -14,22 +14,23 @@ from fusion.arrays import FloatArray
 from fusion.consistency import correlated_error_temperature
 from fusion.estimate import Estimate
 from fusion.modes import GaussianMixture
-from fusion.odometry import OdometryIncrement
+from fusion.odometry import OdometryIncrement, accumulate
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.prior import UniformPrior
 from learned.matcher import MapMatcher, SearchRegion
 from sequences.drive import Drive
 from sequences.measurement import Measurement
 from sequences.run_result import FrameRow, Snapshot
-from sequences.search import first_search, next_search
+from sequences.search import Phase, SearchPlan
 from sequences.sequence import ScanError
 from sequences.snapshots import take_snapshot
-from sequences.start import first_cloud
+from sequences.start_cloud import StartCloud
 from sequences.track_settings import TrackSettings
 from sequences.trajectory_io import format_seconds
 
 STAGES = ("scan", "match", "predict", "update")
-_FILTER_STREAM, _CLOUD_STREAM = 1, 3
+_FILTER_STREAM = 1
+_START_MEASUREMENTS = 8  # volumes kept in memory at most
 
 
 @dataclass(slots=True)
@@ -93,8 +94,10 @@ class FilterPass:
         self._filter: ParticleFilter | None = None
         self._travelled_m = 0.0
         self._measured_at_m = 0.0
-        self._frames_since_measured = 0
-        self._lost_streak = 0
+        self._since_measured: list[OdometryIncrement] = []
+        self._rng = np.random.default_rng([settings.seed, _FILTER_STREAM])
+        self._start_cloud = StartCloud(prior, settings.particles, settings.outlier_probability, self._rng)
+        self._plan = SearchPlan(prior, settings)
 
     def step(self, frame: int) -> FrameRow:
         """Process one frame; frames come in order from 0.
@@ -107,7 +110,7 @@ class FilterPass:
         watch, reason, evidence = Stopwatch(), "", None
         measurement: Measurement | None
         if self._filter is None:
-            measurement = self._measure(frame, first_search(self._prior, self._settings), watch)
+            measurement = self._measure(frame, self._plan.region(None), watch)
             with watch("update"):
                 self._filter, evidence = self._start(measurement)
         else:
@@ -115,7 +118,8 @@ class FilterPass:
                 self._move(self._filter, frame)
             measurement, reason = self._measure_if_due(self._filter, frame, watch)
             if measurement is not None:
-                evidence = self._update(self._filter, frame, measurement, watch)
+                with watch("update"):
+                    evidence = self._update(self._filter, frame, measurement)
         estimate = self._filter.estimate(self._stamp(frame))
         self._keep(frame, estimate, measurement)
         self.rows.append(
@@ -138,16 +142,14 @@ class FilterPass:
     def _move(self, particles: ParticleFilter, frame: int) -> None:
         increment = self._increments[frame - 1]
         particles.predict(increment)
+        self._plan.move(increment.delta)
         self._travelled_m += float(np.hypot(*increment.delta[:2]))
-        self._frames_since_measured += 1
+        self._since_measured.append(increment)
 
     def _due(self) -> bool:
         if self._settings.measure_every_frames is not None:
-            return self._frames_since_measured >= self._settings.measure_every_frames
+            return len(self._since_measured) >= self._settings.measure_every_frames
         return self._travelled_m - self._measured_at_m >= self._settings.measure_every_m
-
-    def _looks_lost(self) -> bool:
-        return self._lost_streak >= self._settings.lost_patience
 
     def _measure_if_due(
         self, particles: ParticleFilter, frame: int, watch: Stopwatch
@@ -159,9 +161,8 @@ class FilterPass:
         if not self._drive.sequence.map.grid.contains(prediction.pose[:2]):
             reason = "the prediction lies outside the map"
         else:
-            search = next_search(prediction, self._prior, self._settings, self._looks_lost())
             try:
-                return self._measure(frame, search, watch), ""
+                return self._measure(frame, self._plan.region(prediction), watch), ""
             except ScanError as error:
                 reason = str(error)
         self._note(frame, f"not measured: {reason}")
@@ -183,21 +184,24 @@ class FilterPass:
 
     def _start(self, measurement: Measurement) -> tuple[ParticleFilter, float]:
         """The filter after the first measurement, and the ln density that it gave to the start's box."""
-        settings, likelihood = self._settings, measurement.likelihood
-        rng = np.random.default_rng([settings.seed, _CLOUD_STREAM])
-        cloud = first_cloud(likelihood, self._prior, settings.particles, settings.outlier_probability, rng)
-        density = likelihood.log_density(self._prior.sample(settings.particles, rng))
-        particles = ParticleFilter(
-            cloud,
-            np.random.default_rng([settings.seed, _FILTER_STREAM]),
-            ParticleFilterSettings(outlier_probability=settings.outlier_probability),
-        )
-        return particles, float(logsumexp(density) - np.log(len(density)))
+        in_box = self._prior.sample(self._settings.particles, self._rng)
+        density = measurement.likelihood.log_density(in_box)
+        return self._filter_from_start(measurement, None), float(logsumexp(density) - np.log(len(density)))
 
-    def _update(self, particles: ParticleFilter, frame: int, measurement: Measurement, watch: Stopwatch) -> float:
-        with watch("update"):
-            report = particles.update(measurement.likelihood, measurement.temperature)
-        if report.injected:
+    def _filter_from_start(self, measurement: Measurement, motion: OdometryIncrement | None) -> ParticleFilter:
+        """A filter with the posterior of all measurements since the start."""
+        flattened = measurement.likelihood.tempered(measurement.temperature)
+        settings = ParticleFilterSettings(outlier_probability=self._settings.outlier_probability)
+        cloud, log_weights = self._start_cloud.add(flattened, motion)
+        return ParticleFilter(cloud, self._rng, settings, log_weights)
+
+    def _update(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> float:
+        report = particles.update(measurement.likelihood, measurement.temperature)
+        if self._plan.record(measurement.search, report.log_evidence, report.lost_score):
+            self._note(frame, f"searching for {self._plan.phase.value}")
+        if self._plan.phase is Phase.START and len(self._start_cloud) < _START_MEASUREMENTS:
+            self._filter = self._filter_from_start(measurement, accumulate(self._since_measured))
+        elif report.injected:
             self._note(frame, f"evidence collapsed: {report.injected} particles drawn anew from the measurement")
         return report.log_evidence
 
@@ -207,14 +211,13 @@ class FilterPass:
         if measurement is None:
             return
         self.best[frame] = measurement.best_pose()
-        self._measured_at_m, self._frames_since_measured = self._travelled_m, 0
-        self._watch_for_loss(frame, estimate.lost_score)
+        self._measured_at_m, self._since_measured = self._travelled_m, []
         due_at_m = len(self.snapshots) * self._drive.odometry.length_m / self._settings.snapshots
         if len(self.snapshots) < self._settings.snapshots and self._travelled_m >= due_at_m:
             sequence, truth = self._drive.sequence, self._drive.truth
             self.snapshots.append(
                 take_snapshot(
-                    int(self._drive.indices[frame]),
+                    frame,
                     measurement,
                     sequence.map,
                     sequence.ground_z,
@@ -222,12 +225,6 @@ class FilterPass:
                     None if truth is None else truth.poses[frame],
                 )
             )
-
-    def _watch_for_loss(self, frame: int, lost_score: float) -> None:
-        was_lost = self._looks_lost()
-        self._lost_streak = self._lost_streak + 1 if lost_score > self._settings.lost_threshold else 0
-        if self._looks_lost() and not was_lost:
-            self._note(frame, f"lost score {lost_score:.2f}: searching widely")
 
     def _stamp(self, frame: int) -> int:
         return int(self._drive.stamps_ns[frame])

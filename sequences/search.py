@@ -1,56 +1,121 @@
-"""Where a scan is looked for on the map: around what the filter predicts, as wide as the filter is unsure.
+"""Where a scan is looked for on the map: widely until the start is settled, then about the filter's prediction.
 
-The truth never enters. The first search covers the start's whole box; a search is widened to that size again, and in
-heading, after the filter has looked lost for a while.
+The truth never enters. A likelihood that was evaluated in a narrow search cannot say that nothing in it fits, and a
+filter that began on the wrong street confirms itself there. So at first every search covers the start's whole box,
+carried along by the odometry, in all of its headings. It narrows when several measurements in a row have agreed with
+the filter, and widens when several have not.
 """
 
 from __future__ import annotations
 
 import math
+from enum import Enum
 
 import numpy as np
 
+from fusion import se2
+from fusion.arrays import FloatArray
 from fusion.estimate import Estimate
 from fusion.prior import UniformPrior
 from learned.matcher import SearchRegion
 from sequences.track_settings import TrackSettings
 
-_LOST_HALF_HEADING_RAD = math.radians(45.0)
+_AGREEMENT_NATS = 1.0  # by which the prediction explains a measurement better than a random pose of the search
 _HEADING_MARGIN_RAD = math.radians(1.0)
+_LOST_HALF_HEADING_RAD = math.radians(45.0)
+_ABOUT_THE_START_RAD = math.radians(60.0)
 
 
-def first_search(prior: UniformPrior, settings: TrackSettings) -> SearchRegion:
-    """The start's box and a margin."""
-    return SearchRegion(
-        centre=prior.mean,
-        half_extent_m=prior.half_extent_m + settings.search_margin_m,
-        half_heading_rad=min(prior.half_heading_rad + _HEADING_MARGIN_RAD, math.pi),
-    )
+class Phase(Enum):
+    """What the search is for."""
+
+    START = "the start"
+    TRACK = "the vehicle about the filter's prediction"
+    LOST = "a lost vehicle"
 
 
-def next_search(prediction: Estimate, prior: UniformPrior, settings: TrackSettings, lost: bool) -> SearchRegion:
-    """The region about the filter's prediction.
+class SearchPlan:
+    """Decides on the region of each measurement.
 
     Parameters
     ----------
-    prediction
-        The filter's estimate, odometry up to this frame applied.
     prior
-        The start; its box bounds the search from above where it is larger than the stated maximum.
+        The start's box.
     settings
-        Bounds and the number of standard deviations.
-    lost
-        Whether to search as widely as allowed.
+        Bounds, margins and how many measurements in a row settle something.
     """
-    sigma = np.sqrt(np.diag(prediction.covariance))
-    half_extent = settings.search_sigmas * float(sigma[:2].max())
-    half_heading = settings.search_sigmas * float(sigma[2])
-    least_m, least_rad = settings.search_min_half_extent_m, math.radians(settings.search_min_half_heading_deg)
-    widest_m = max(settings.search_max_half_extent_m, prior.half_extent_m + settings.search_margin_m)
-    if lost:
-        least_m, least_rad = widest_m, max(least_rad, _LOST_HALF_HEADING_RAD)
-    return SearchRegion(
-        centre=prediction.pose,
-        half_extent_m=min(max(half_extent, least_m), widest_m),
-        half_heading_rad=min(max(half_heading, least_rad), math.pi),
-    )
+
+    def __init__(self, prior: UniformPrior, settings: TrackSettings) -> None:
+        self._prior, self._settings = prior, settings
+        self._moved = np.zeros(3)  # odometry since the start, seen from the first body frame
+        self._agreeing = self._disagreeing = 0
+        self._lost_half_heading_rad = prior.half_heading_rad
+        self.phase = Phase.START
+
+    def move(self, delta: FloatArray) -> None:
+        """Carry the start's box along by an odometry increment (3,), in the body frame before it."""
+        self._moved = se2.compose(self._moved, delta)
+
+    def region(self, prediction: Estimate | None) -> SearchRegion:
+        """The poses to score; `prediction` is the filter's, None before there is one."""
+        if self.phase is Phase.START:
+            start = self._start_carried_along()
+            if prediction is None or start.half_extent_m <= self._widest_start_m:
+                return start
+            self.phase = Phase.LOST
+        assert prediction is not None  # a filter exists after the first measurement
+        sigma = self._settings.search_sigmas * np.sqrt(np.diag(prediction.covariance))
+        least_m, most_m = self._settings.search_min_half_extent_m, self._settings.search_max_half_extent_m
+        least_rad = math.radians(self._settings.search_min_half_heading_deg)
+        if self.phase is Phase.LOST:
+            least_m, least_rad = most_m, max(least_rad, self._lost_half_heading_rad)
+        return SearchRegion(
+            centre=prediction.pose,
+            half_extent_m=min(max(float(sigma[:2].max()), least_m), most_m),
+            half_heading_rad=min(max(float(sigma[2]), least_rad), math.pi),
+        )
+
+    def record(self, search: SearchRegion, log_evidence: float, lost_score: float) -> bool:
+        """Note how well the prediction explained a measurement; True when that has changed the phase.
+
+        Parameters
+        ----------
+        search
+            Where it was made.
+        log_evidence
+            ln density per m^2 rad that the measurement gave to the prediction.
+        lost_score
+            The filter's own, after it.
+        """
+        searched = (2.0 * search.half_extent_m) ** 2 * 2.0 * search.half_heading_rad
+        nats = log_evidence + math.log(searched)  # over the density of a pose anywhere in the search
+        is_lost = nats < 0.0 or lost_score > self._settings.lost_threshold
+        self._agreeing = self._agreeing + 1 if nats > _AGREEMENT_NATS and not is_lost else 0
+        self._disagreeing = self._disagreeing + 1 if is_lost else 0
+        before = self.phase
+        if self._agreeing >= self._settings.patience:
+            self.phase = Phase.TRACK
+            self._lost_half_heading_rad = _LOST_HALF_HEADING_RAD
+        elif self.phase is Phase.TRACK and self._disagreeing >= self._settings.patience:
+            self.phase = Phase.LOST
+        return self.phase is not before
+
+    @property
+    def _widest_start_m(self) -> float:
+        return self._prior.half_extent_m + self._settings.search_margin_m + self._settings.search_start_growth_m
+
+    def _start_carried_along(self) -> SearchRegion:
+        """The start's box and a margin, moved by the odometry and grown by what its headings leave open."""
+        way_m = float(np.hypot(*self._moved[:2]))
+        half_heading = self._prior.half_heading_rad
+        if half_heading <= _ABOUT_THE_START_RAD:
+            centre = se2.compose(self._prior.mean, self._moved)
+            growth = 2.0 * way_m * math.sin(0.5 * half_heading)
+        else:  # a disc about the start is smaller than one about where the odometry points
+            centre = self._prior.mean + [0.0, 0.0, self._moved[2]]
+            growth = way_m
+        return SearchRegion(
+            centre=centre,
+            half_extent_m=self._prior.half_extent_m + self._settings.search_margin_m + growth,
+            half_heading_rad=min(half_heading + _HEADING_MARGIN_RAD, math.pi),
+        )

@@ -1,4 +1,4 @@
-"""How a drive starts: the box that its first pose lies in, and the particles after the first measurement."""
+"""How a drive starts: the box that its first pose lies in, and what that box is worth as an answer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
-from fusion.likelihood import PoseLikelihood
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 from sequences.drive import Drive
@@ -16,7 +15,6 @@ from sequences.sequence import Sequence
 from sequences.track_settings import TrackSettings
 
 _START_STREAM, _PRIOR_STREAM = 0, 2
-_CLOUD_ROUNDS = 20
 
 
 def start_prior(drive: Drive, settings: TrackSettings) -> UniformPrior:
@@ -59,26 +57,6 @@ def offset_in_box(half_extent_m: float, half_heading_rad: float, rng: np.random.
     """Offsets (n, 3) uniform over a box on the axes of the map, metres and radians."""
     half = np.array([half_extent_m, half_extent_m, half_heading_rad])
     return rng.uniform(-half, half, size=(n, 3))
-
-
-def first_cloud(
-    likelihood: PoseLikelihood, prior: UniformPrior, n: int, outlier_probability: float, rng: np.random.Generator
-) -> FloatArray:
-    """Particles (n, 3) of the posterior after the first measurement.
-
-    Under a prior that is uniform in a box the posterior is the likelihood cut to that box, so particles are drawn
-    from the one and kept where they lie in the other. A share equal to the outlier probability, and what is missing
-    when the likelihood lies almost wholly outside the box, comes from the box itself. Prior particles weighted by a
-    sharp likelihood would come to the same with very many of them.
-    """
-    wanted = n - round(outlier_probability * n)
-    kept = np.empty((0, 3))
-    for _ in range(_CLOUD_ROUNDS):
-        drawn = likelihood.sample(n, rng)
-        kept = np.concatenate([kept, drawn[prior.contains(drawn)]])[:wanted]
-        if len(kept) == wanted:
-            break
-    return np.concatenate([kept, prior.sample(n - len(kept), rng)])
 
 
 def _require_inside(sequence: Sequence, xy: FloatArray, label: str) -> None:

@@ -32,10 +32,12 @@ class TrackSettings:
     measure_every_frames
         When given, every so many frames instead.
     search_min_half_extent_m, search_max_half_extent_m
-        Bounds of the searched square's half side. The search also covers the whole start box until the position is
-        known.
+        Bounds of the searched square's half side about the filter's prediction.
     search_min_half_heading_deg
         Least half width of the searched headings.
+    search_start_growth_m
+        Until the start is settled a search covers its whole box, carried along, and what its unknown heading adds up to
+        this; see `search`.
     search_margin_m
         Added to the start box in the first search, so that a truth at its edge still has its surroundings.
     search_sigmas
@@ -50,8 +52,9 @@ class TrackSettings:
         Chance that a measurement says nothing about the pose.
     modes
         Gaussians kept of each measurement for the smoother.
-    lost_threshold, lost_patience
-        The search is widened after so many measurements in a row with a lost score above the threshold.
+    lost_threshold, patience
+        A measurement agrees with the filter when it fits its prediction and leaves its lost score below the threshold.
+        The search narrows after so many in a row that do, and widens after so many that do not.
     snapshots
         Measured frames kept for the report.
     noise
@@ -70,13 +73,14 @@ class TrackSettings:
     search_max_half_extent_m: float = 24.0
     search_min_half_heading_deg: float = 6.0
     search_margin_m: float = 2.0
+    search_start_growth_m: float = 40.0
     search_sigmas: float = 3.5
     correlation_length_m: float | None = None
     map_error_m: float = 0.4
     outlier_probability: float = 0.05
     modes: int = 5
     lost_threshold: float = 0.5
-    lost_patience: int = 3
+    patience: int = 3
     snapshots: int = 6
     noise: OdometryNoise = field(default_factory=OdometryNoise)
 
@@ -86,7 +90,7 @@ class TrackSettings:
             numbers = value if isinstance(value, tuple) else (value,)
             if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
                 raise SkyfixError(f"{entry.name}: expected a finite number, got {value}")
-        positive = ("particles", "half_extent_m", "half_heading_deg", "modes", "lost_patience", "search_sigmas")
+        positive = ("particles", "half_extent_m", "half_heading_deg", "modes", "patience", "search_sigmas")
         lengths = ("search_min_half_extent_m", "search_max_half_extent_m", "search_min_half_heading_deg")
         for name in (*positive, *lengths):
             if getattr(self, name) <= 0:
@@ -95,7 +99,14 @@ class TrackSettings:
             raise SkyfixError(f"half_heading_deg: expected at most 180, got {self.half_heading_deg:g}")
         if self.measure_every_frames is not None and self.measure_every_frames < 1:
             raise SkyfixError(f"measure_every_frames: expected 1 or more, got {self.measure_every_frames}")
-        for name in ("measure_every_m", "search_margin_m", "map_error_m", "correlation_length_m", "snapshots"):
+        for name in (
+            "measure_every_m",
+            "search_margin_m",
+            "search_start_growth_m",
+            "map_error_m",
+            "correlation_length_m",
+            "snapshots",
+        ):
             if (getattr(self, name) or 0) < 0:
                 raise SkyfixError(f"{name}: expected 0 or more, got {getattr(self, name):g}")
         if self.seed < 0:

@@ -42,13 +42,17 @@ class MadeDrive:
 
 @dataclass
 class EmulatedMatcher:
-    """Knows the truth: implements the matchers' protocol with Gaussian likelihoods about it."""
+    """Knows the truth: implements the matchers' protocol with Gaussian likelihoods about it.
+
+    At the frames in `mistakes` it errs by as much, (x, y, yaw) on the axes of the map, and is as sure as ever.
+    """
 
     truth: NDArray[np.float64]
     sigma_m: float = 0.5
     sigma_rad: float = float(np.deg2rad(2.0))
     name: str = "emulated"
     error_correlation_length_m: float = 0.0
+    mistakes: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     searches: list[SearchRegion] = field(default_factory=list)
 
     def match(
@@ -57,7 +61,7 @@ class EmulatedMatcher:
         self.searches.append(search)
         index = round(float(points[0, 3]) * 1000)
         noise = np.random.default_rng([7, index]).normal(size=3) * [self.sigma_m, self.sigma_m, self.sigma_rad]
-        centre = self.truth[index] + noise
+        centre = self.truth[index] + noise + self.mistakes.get(index, np.zeros(3))
         grid = map_raster.grid.window(search.centre[:2], search.half_extent_m)
         x, y = grid.centres()
         yaw = np.arange(YAW_BINS) * 2.0 * np.pi / YAW_BINS

@@ -16,11 +16,10 @@ from made_drive import STEP_M, EmulatedMatcher, MadeDrive, made_scan
 import sequences.run_directory as run_directory
 from fusion import se2
 from fusion.errors import SkyfixError
-from fusion.estimate import Estimate
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
-from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
+from learned.matcher import SearchRegion
 from sequences.drive import load_drive
 from sequences.folder import FolderSequence
 from sequences.localize import track
@@ -28,9 +27,8 @@ from sequences.measurement import Measurement
 from sequences.run_directory import write_run
 from sequences.run_metrics import TIMING_KEYS
 from sequences.run_result import FrameRow, RunResult
-from sequences.search import first_search, next_search
 from sequences.sequence import ScanError
-from sequences.start import first_cloud, prior_answers, start_prior
+from sequences.start import prior_answers, start_prior
 from sequences.track_settings import TrackSettings
 from sequences.trajectory_io import read_tum
 
@@ -106,45 +104,30 @@ def test_the_prior_scores_what_the_middle_of_its_box_scores() -> None:
     assert heading_deg.mean() == pytest.approx(5.0, abs=0.1)
 
 
-def test_searches_follow_the_filter_and_start_with_the_whole_box(made_drive: MadeDrive) -> None:
+def test_a_search_covers_the_start_until_it_is_settled_then_follows_the_filter(made_drive: MadeDrive) -> None:
     matcher = EmulatedMatcher(made_drive.truth.poses)
     result = track(FolderSequence(made_drive.path), matcher, SETTINGS)
-    first = matcher.searches[0]
-    np.testing.assert_array_equal(first.centre, result.prior.mean)
-    assert first.half_extent_m == 22.0
-    assert np.rad2deg(first.half_heading_rad) == pytest.approx(11.0)
     measured = [row for row in result.frame_rows if row.measured]
     assert len(measured) == len(matcher.searches)
-    for search, row in zip(matcher.searches[1:], measured[1:], strict=True):
-        assert 12.0 <= search.half_extent_m <= 24.0
-        assert np.deg2rad(6.0) <= search.half_heading_rad <= np.pi
-        assert (row.search_half_extent_m, row.search_half_heading_rad) == (
-            search.half_extent_m,
-            search.half_heading_rad,
-        )
+    for search, row in zip(matcher.searches, measured, strict=True):
+        assert row.search_half_extent_m == search.half_extent_m
+        assert row.search_half_heading_rad == search.half_heading_rad
+    np.testing.assert_array_equal(matcher.searches[0].centre, result.prior.mean)
+    assert [search.half_extent_m >= 22.0 for search in matcher.searches[:5]] == [True, True, True, True, False]
+    for search, row in zip(matcher.searches[4:], measured[4:], strict=True):
+        assert search.half_extent_m == 12.0
         frame = int(np.flatnonzero(result.stamps_ns == row.stamp_ns)[0])
         assert np.hypot(*(search.centre - result.filter.poses[frame])[:2]) < 3.0
         assert not np.array_equal(search.centre, made_drive.truth.poses[frame])
 
 
-def estimate(sigma_m: float, sigma_rad: float) -> Estimate:
-    covariance = np.diag([sigma_m**2, (0.5 * sigma_m) ** 2, sigma_rad**2])
-    return Estimate(0, np.array([1.0, 2.0, 0.3]), covariance, None, 100.0, 0.0, 0.0)
-
-
-def test_a_search_is_as_wide_as_the_filter_is_unsure_within_bounds() -> None:
-    prior = UniformPrior(np.zeros(3), 20.0, np.deg2rad(10.0))
-    for sigma, expected in [(0.1, 12.0), (5.0, 17.5), (50.0, 24.0)]:
-        assert next_search(estimate(sigma, 0.01), prior, SETTINGS, lost=False).half_extent_m == pytest.approx(expected)
-    for sigma, expected in [(0.001, np.deg2rad(6.0)), (0.1, 0.35), (2.0, np.pi)]:
-        assert next_search(estimate(1.0, sigma), prior, SETTINGS, lost=False).half_heading_rad == pytest.approx(
-            expected
-        )
-    lost = next_search(estimate(0.1, 0.001), prior, SETTINGS, lost=True)
-    assert (lost.half_extent_m, np.rad2deg(lost.half_heading_rad)) == pytest.approx((24.0, 45.0))
-    wide = UniformPrior(np.zeros(3), 60.0, np.pi)
-    assert first_search(wide, SETTINGS).half_heading_rad == np.pi
-    assert next_search(estimate(50.0, 0.01), wide, SETTINGS, lost=False).half_extent_m == pytest.approx(62.0)
+def test_a_first_scan_that_fits_the_wrong_street_does_not_decide(made_drive: MadeDrive) -> None:
+    wrong = {0: np.array([6.0, 9.0, np.pi])}
+    settings = replace(SETTINGS, half_heading_deg=180.0)
+    result = run(made_drive, settings, mistakes=wrong)
+    errors = np.hypot(*(result.filter.poses - made_drive.truth.poses)[:, :2].T)
+    assert errors[0] > 5.0
+    assert errors[5:].max() < 2.5
 
 
 @pytest.mark.parametrize(("every_m", "gap"), [(0.0, 1), (4.0, 2), (10.0, 5)])
@@ -233,32 +216,6 @@ def test_progress_hears_of_every_frame(made_drive: MadeDrive) -> None:
     np.testing.assert_allclose(np.array(recorder.errors, dtype=float), expected, atol=1e-6)
 
 
-def test_the_first_cloud_is_the_likelihood_cut_to_the_box() -> None:
-    grid = MapGrid(80, 80, 0.5, -20.0, -20.0)
-    x, y = grid.centres()
-    yaw = np.arange(72) * 2.0 * np.pi / 72
-    squared = ((x[None, :, None] - 4.0) / 3.0) ** 2 + ((y[:, None, None] + 1.0) / 2.0) ** 2 + (se2.wrap(yaw) / 0.2) ** 2
-    likelihood = LikelihoodVolume.from_scores(-0.5 * squared, grid)
-    prior = UniformPrior(np.zeros(3), 4.0, 0.5)
-    cloud = first_cloud(likelihood, prior, 20_000, 0.1, np.random.default_rng(0))
-    assert cloud.shape == (20_000, 3)
-    assert prior.contains(cloud).all()
-    # x of the likelihood cut at its mean, 4, and at -4 is nearly half a normal, mean 4 - 3 sqrt(2 / pi); 10 % have 0.
-    cut = 4.0 - 3.0 * (np.sqrt(2 / np.pi) * (1 - np.exp(-0.5 * (8 / 3) ** 2)) / 0.9923)
-    assert cloud[:, 0].mean() == pytest.approx(0.9 * cut, abs=0.06)
-
-
-def test_the_first_cloud_falls_back_on_the_box_when_the_likelihood_lies_elsewhere() -> None:
-    grid = MapGrid(80, 80, 0.5, -20.0, -20.0)
-    scores = np.full((80, 80, 36), -200.0)
-    scores[3, 76, :] = 0.0  # a corner of the crop
-    likelihood = LikelihoodVolume.from_scores(scores, grid)
-    prior = UniformPrior(np.zeros(3), 5.0, 0.5)
-    cloud = first_cloud(likelihood, prior, 500, 0.05, np.random.default_rng(0))
-    assert cloud.shape == (500, 3)
-    assert prior.contains(cloud).all()
-
-
 @pytest.mark.parametrize("yaw", [0.02, 3.1, -3.13])
 def test_the_best_pose_is_finer_than_a_cell(yaw: float) -> None:
     grid = MapGrid(60, 60, 0.5, -15.0, -15.0)
@@ -267,7 +224,7 @@ def test_the_best_pose_is_finer_than_a_cell(yaw: float) -> None:
     squared = ((x[None, :, None] - 1.37) ** 2 + (y[:, None, None] + 2.21) ** 2) / 0.3**2
     squared = squared + (se2.wrap(bins - yaw) / np.deg2rad(2.0)) ** 2
     volume = LikelihoodVolume.from_scores(-0.5 * squared, grid)
-    search = first_search(UniformPrior(np.zeros(3), 10.0, np.pi), SETTINGS)
+    search = SearchRegion(np.zeros(3), 10.0)
     best = Measurement(np.zeros((1, 4), np.float32), search, volume, 1.0).best_pose()
     assert np.hypot(best[0] - 1.37, best[1] + 2.21) < 0.1
     assert abs(se2.wrap(best[2] - yaw)) < np.deg2rad(0.5)
@@ -366,7 +323,7 @@ def test_modes_for_the_smoother_are_flattened_one_by_one() -> None:
         return weight * np.exp(-0.5 * squared)
 
     volume = LikelihoodVolume.from_scores(np.log(bump(-8.0, 0.9) + bump(8.0, 0.1) + 1e-12), grid)
-    search = first_search(UniformPrior(np.zeros(3), 10.0, np.pi), SETTINGS)
+    search = SearchRegion(np.zeros(3), 10.0)
     scan = np.zeros((1, 4), np.float32)
     sharp, flat = (Measurement(scan, search, volume, temperature).modes(5) for temperature in (1.0, 4.0))
     np.testing.assert_allclose(sharp.weights, [0.9, 0.1], atol=0.01)

@@ -364,3 +364,13 @@ def test_particles_cannot_be_changed_from_outside():
     particles = ParticleFilter(np.zeros((5, 3)), 0)
     with pytest.raises(ValueError, match="read-only"):
         particles.particles[0, 0] = 1.0
+
+
+def test_a_weighted_cloud_is_the_same_as_one_with_repeats():
+    """Weights given at the start count like particles: 1:3 is one particle and three of the other."""
+    poses = np.array([[0.0, 0.0, 0.1], [4.0, 2.0, -0.3]])
+    weighted = ParticleFilter(poses, 0, log_weights=np.log([1.0, 3.0]) + 7.0).estimate(0)
+    repeated = ParticleFilter(poses[[0, 1, 1, 1]], 0).estimate(0)
+    np.testing.assert_allclose(weighted.pose, repeated.pose, atol=1e-12)
+    with pytest.raises(SkyfixError, match="log weights"):
+        ParticleFilter(poses, 0, log_weights=[0.0, np.nan])

@@ -1,0 +1,110 @@
+"""The particles while the start is being found: drawn from every measurement so far, weighted by all of them.
+
+One scan often fits the wrong street best. A filter that begins with its first measurement alone then has hardly a
+particle on the right one, and the next measurements, which would know, find nothing to weigh. So until the start is
+settled the cloud is made anew with each measurement. Its target is the posterior of the path x_0 .. x_k,
+
+    U(x_0) prod_i L_i(x_i) prod_i p(x_i | x_i-1, odometry),
+
+with U the start's box and L_i the flattened likelihoods with their share of outliers. Paths are proposed from the box
+and from each likelihood in turn, drawn there and carried to the other measurements by noisy odometry, and weighted by
+the target over the mixture of the proposals (Veach and Guibas, "Optimally combining sampling techniques for Monte
+Carlo rendering", 1995: the balance heuristic). The odometry's density is common to all of them and cancels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import logsumexp
+
+from fusion import se2
+from fusion.arrays import FloatArray
+from fusion.likelihood import PoseLikelihood
+from fusion.odometry import OdometryIncrement
+from fusion.prior import UniformPrior
+
+_BOX_SHARE = 0.2
+
+
+class StartCloud:
+    """Weighted particles of the posterior after the first few measurements.
+
+    Parameters
+    ----------
+    prior
+        The start's box.
+    size
+        Number of particles.
+    outlier_probability
+        Chance that a measurement is about nothing.
+    rng
+        Source of all randomness.
+    """
+
+    def __init__(self, prior: UniformPrior, size: int, outlier_probability: float, rng: np.random.Generator) -> None:
+        self._prior, self._size, self._outlier_probability, self._rng = prior, size, outlier_probability, rng
+        self._likelihoods: list[PoseLikelihood] = []
+        self._drawn: list[FloatArray] = []
+        self._motions: list[OdometryIncrement] = []
+
+    def __len__(self) -> int:
+        return len(self._likelihoods)
+
+    def add(self, likelihood: PoseLikelihood, motion: OdometryIncrement | None) -> tuple[FloatArray, FloatArray]:
+        """Take in one more measurement.
+
+        Parameters
+        ----------
+        likelihood
+            Flattened for errors shared with the measurement before.
+        motion
+            Odometry since that one; None for the first.
+
+        Returns
+        -------
+        Particles (n, 3) at this measurement and their log weights (n,), not normalised.
+        """
+        self._likelihoods.append(likelihood)
+        self._drawn.append(likelihood.sample(self._size, self._rng))
+        if motion is not None:
+            self._motions.append(motion)
+        paths = np.concatenate([self._carried(*proposal) for proposal in self._proposals()], axis=1)
+        return paths[-1], self._log_weights(paths)
+
+    def _shares(self) -> FloatArray:
+        """Share of the paths proposed from the box and from each likelihood, (k + 2,)."""
+        count = len(self._likelihoods)
+        return np.array([_BOX_SHARE, *np.full(count, (1.0 - _BOX_SHARE) / count)])
+
+    def _proposals(self) -> list[tuple[int, FloatArray]]:
+        """Poses drawn at one measurement each: (its number, (n, 3))."""
+        sizes = np.diff(np.rint(np.cumsum([0.0, *self._shares()]) * self._size).astype(int))
+        drawn = [(0, self._prior.sample(int(sizes[0]), self._rng))]
+        return drawn + [(number, poses[: sizes[number + 1]]) for number, poses in enumerate(self._drawn)]
+
+    def _carried(self, number: int, poses: FloatArray) -> FloatArray:
+        """Paths (k + 1, n, 3) through all measurements from poses (n, 3) at one of them, by odometry with new noise."""
+        path = [poses]
+        for motion in self._motions[number:]:
+            path.append(se2.compose(path[-1], self._noisy(motion, len(poses))))
+        for motion in reversed(self._motions[:number]):
+            path.insert(0, se2.compose(path[0], se2.inverse(self._noisy(motion, len(poses)))))
+        return np.array(path)
+
+    def _noisy(self, motion: OdometryIncrement, n: int) -> FloatArray:
+        """Deltas (n, 3)."""
+        return motion.delta + self._rng.multivariate_normal(np.zeros(3), motion.covariance, n, method="eigh")
+
+    def _log_weights(self, paths: FloatArray) -> FloatArray:
+        """Target over proposals, (n,), of paths (k + 1, n, 3)."""
+        box = np.where(self._prior.contains(paths[0]), self._log_box_density(), -np.inf)
+        proposals, target = [box], box.copy()
+        for likelihood, poses in zip(self._likelihoods, paths, strict=True):
+            proposals.append(likelihood.log_density(poses))
+            target += likelihood.with_outliers(self._outlier_probability).log_density(poses)
+        weights = target - logsumexp(np.array(proposals), axis=0, b=self._shares()[:, None])
+        return np.maximum(weights, np.max(weights) - 700.0)
+
+    def _log_box_density(self) -> float:
+        box = self._prior
+        return -float(np.log((2.0 * box.half_extent_m) ** 2 * 2.0 * box.half_heading_rad))
