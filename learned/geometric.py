@@ -52,11 +52,11 @@ class GeometricMatcher:
         map lacks.
     """
 
-    bev: BevSettings = field(default_factory=BevSettings)
+    bev: BevSettings = field(default_factory=lambda: BevSettings(half_extent_m=72.0))
     weights: GeometricWeights = field(default_factory=GeometricWeights)
     yaw_bins: int = 360
-    temperature: float = 8.0
-    error_correlation_length_m: float = 15.0
+    temperature: float = 19.0
+    error_correlation_length_m: float = 6.0
     name: str = "geometric"
 
     def match(

@@ -9,7 +9,7 @@ chosen for two CPU cores.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -88,6 +88,16 @@ class RotMatchNet(nn.Module):
         self.map_encoder = FeatureNet(3, settings.channels, settings.widths)
         self.log_scale = nn.Parameter(torch.zeros(()))
 
+    def reaching(self, half_extent_m: float) -> RotMatchNet:
+        """The same weights for a scan image of another extent; the encoders are convolutional, so any will do.
+
+        Training on a short reach is cheap; matching with a long one sees the next crossing.
+        """
+        bev = replace(self.settings.bev, half_extent_m=half_extent_m)
+        net = RotMatchNet(replace(self.settings, bev=bev))
+        net.load_state_dict(self.state_dict())
+        return net
+
     def scan_features(self, density: Tensor) -> Tensor:
         """(B, bands, n, n) log densities -> (B, C, n / 2, n / 2): unit vectors times the worth of their cell."""
         raw = self.scan_encoder(density)
@@ -112,7 +122,7 @@ class Calibration:
     """
 
     temperature: float = 1.0
-    error_correlation_length_m: float = 15.0
+    error_correlation_length_m: float = 6.0
 
 
 class RotMatch:

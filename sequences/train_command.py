@@ -32,13 +32,19 @@ _HELD_OUT_HALF_EXTENT_M = 20.0
 
 
 class TrainConfig(BaseModel):
-    """A training run; unknown keys are refused."""
+    """A training run; unknown keys are refused.
+
+    Training sees scans to the reach of `training.network.bev`; afterwards the network is calibrated, and used, with
+    scans to `matching_half_extent_m`.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     extracts: dict[str, float]
+    matching_half_extent_m: float = 72.0
     validation_extract: str
     validation_samples: int = 96
+    calibration_samples: int = 64
     simulation: SimulationSettings = SimulationSettings()
     training: TrainingSettings = TrainingSettings()
 
@@ -99,7 +105,17 @@ def train_from_config(config_path: Path, data_dir: Path, out_dir: Path, progress
     validation = SimulatedSamples([(validation_features, 1.0)], held_out, out_dir / "cache" / "validation")
     net = train(source, validation, config.training, out_dir, progress)
     draw_loss_curve(out_dir / "loss.csv", out_dir / "loss.png")
-    matcher, held_out_metrics = calibrated(RotMatch(net), [validation[i] for i in range(len(validation))])
+    reaching = replace(
+        held_out,
+        samples=config.calibration_samples,
+        bev_half_extent_m=config.matching_half_extent_m,
+        sample_px=4 * round(config.matching_half_extent_m + 2 * _HELD_OUT_HALF_EXTENT_M + 2),
+        area_half_extent_m=config.simulation.scan_half_extent_m + config.matching_half_extent_m + 44.0,
+    )
+    far = SimulatedSamples([(validation_features, 1.0)], reaching, out_dir / "cache" / "calibration")
+    matcher, held_out_metrics = calibrated(
+        RotMatch(net.reaching(config.matching_half_extent_m)), [far[i] for i in range(len(far))]
+    )
     path = out_dir / "rotmatch.safetensors"
     matcher.save(
         path,

@@ -42,6 +42,8 @@ class SimulationSettings:
         Half the side of the square in which scans are taken.
     sample_px
         Side of the class raster kept with a sample, pixels of 0.5 m.
+    bev_half_extent_m
+        Reach of the bird's-eye views; scans are cast half as far again, up to the sensor's range.
     azimuths
         Beams of one elevation per simulated revolution: drawn from this range for each area.
     least_buildings
@@ -53,6 +55,7 @@ class SimulationSettings:
     area_half_extent_m: float = 124.0
     scan_half_extent_m: float = 55.0
     sample_px: int = 336
+    bev_half_extent_m: float = 40.0
     azimuths: tuple[int, int] = (900, 2000)
     least_buildings: int = 5
     seed: int = 0
@@ -144,7 +147,8 @@ class SimulatedSamples:
             if len(poses) < settings.samples_per_area or map_raster.classes is None:
                 continue
             azimuths = int(rng.integers(settings.azimuths[0], settings.azimuths[1] + 1))
-            model = replace(LidarModel.random(rng, azimuths), max_range_m=1.5 * BevSettings().half_extent_m)
+            model = LidarModel.random(rng, azimuths)
+            model = replace(model, max_range_m=min(1.5 * settings.bev_half_extent_m, model.max_range_m))
             return [self._sample(pose, model, world, map_raster.classes, grid, rng) for pose in poses]
         raise SkyfixError(f"training data: found no neighbourhood with roads and buildings in {_ATTEMPTS} attempts")
 
@@ -159,7 +163,7 @@ class SimulatedSamples:
     ) -> Sample:
         scan = simulate_scan(world, pose, model, rng)
         row, col = grid.pixel_from_xy(pose[:2])
-        counts = bev_counts(scan, -model.mount_height_m, BevSettings())
+        counts = bev_counts(scan, -model.mount_height_m, BevSettings(self.settings.bev_half_extent_m))
         return cut_sample(counts, classes, float(row), float(col), float(pose[2]), self.settings.sample_px)
 
 

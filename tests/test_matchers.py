@@ -150,3 +150,16 @@ def test_unknown_matchers_are_named() -> None:
         load_matcher("nonsense")
     with pytest.raises(SkyfixError, match="no such file"):
         load_matcher("missing.safetensors")
+
+
+def test_a_longer_reach_uses_the_same_weights_and_sees_farther() -> None:
+    torch.manual_seed(4)
+    near = RotMatchNet(SMALL)
+    far = near.reaching(56.0)
+    assert far.settings.bev.size == 224
+    for (name, a), (other, b) in zip(near.state_dict().items(), far.state_dict().items(), strict=True):
+        assert name == other
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    city, scan = street_of_walls(np.zeros(3))
+    volume = RotMatch(far).match(scan, -1.7, city, SearchRegion(np.zeros(3), 10.0, 0.1))
+    assert volume.grid.contains(np.array([9.9, -9.9]))

