@@ -85,12 +85,16 @@ class SmootherResult:
         Rounds of choosing and optimising.
     converged : bool
         Whether the choices held in the end.
+    cost : float
+        Half the sum of squared whitened residuals (robust ones weighed) at the solution: its negative log posterior up
+        to a constant, to compare smoothings of the same measurements by.
     """
 
     trajectory: Trajectory
     chosen: IntArray
     iterations: int
     converged: bool
+    cost: float
 
 
 def smooth(
@@ -141,12 +145,12 @@ def smooth(
     seen: set[bytes] = set()
     while True:
         seen.add(choice.tobytes())
-        poses, covariances = _optimise(chain, hypotheses, choice, poses)
+        poses, covariances, cost = _optimise(chain, hypotheses, choice, poses)
         cavities = hypotheses.cavities(poses, covariances, choice)
         revised = hypotheses.choose(*cavities, p, clutter)
         converged = bool((revised == choice).all())
         if converged or len(seen) == settings.max_iterations or revised.tobytes() in seen:
-            return SmootherResult(Trajectory(stamps, poses, covariances), choice, len(seen), converged)
+            return SmootherResult(Trajectory(stamps, poses, covariances), choice, len(seen), converged, cost)
         choice = revised
 
 
@@ -201,8 +205,8 @@ def _chain(
 
 def _optimise(
     chain: gtsam.NonlinearFactorGraph, hypotheses: Hypotheses, choice: IntArray, start: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Poses (N, 3) and map-frame marginal covariances (N, 3, 3) with the chosen modes as factors."""
+) -> tuple[FloatArray, FloatArray, float]:
+    """Poses (N, 3), map-frame marginal covariances (N, 3, 3) and cost with the chosen modes as factors."""
     graph = gtsam.NonlinearFactorGraph(chain)
     for row in hypotheses.chosen_rows(choice):
         mean = hypotheses.means[row]
@@ -221,6 +225,7 @@ def _optimise(
     except RuntimeError as error:
         raise SkyfixError(f"smoother: expected a solvable graph, got {str(error).strip().splitlines()[0]}") from error
     poses = np.array(gtsam.utilities.extractPose2(values)).reshape(-1, 3)
-    if not (np.isfinite(graph.error(values)) and np.isfinite(poses).all() and np.isfinite(covariances).all()):
+    cost = float(graph.error(values))
+    if not (np.isfinite(cost) and np.isfinite(poses).all() and np.isfinite(covariances).all()):
         raise SkyfixError("smoother: expected a finite solution, got NaN or an infinity")
-    return poses, _positive_definite(_turned(covariances, poses[:, 2]))
+    return poses, _positive_definite(_turned(covariances, poses[:, 2])), cost

@@ -13,10 +13,11 @@ from typing import Protocol
 
 import numpy as np
 
-from fusion.factor_graph import SmootherSettings, smooth
+from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
 from fusion.odometry import increments_at
 from fusion.trajectory import Trajectory
 from learned.matcher import MapMatcher
+from sequences.clock_offset import shifted, with_best_offset
 from sequences.drive import Drive, load_drive, place_odometry
 from sequences.filter_pass import FilterPass
 from sequences.metrics import position_errors
@@ -81,7 +82,13 @@ def track(
     )
     begin = time.perf_counter()
     smoother_settings = SmootherSettings(outlier_probability=settings.outlier_probability)
-    smoothed = smooth(drive.stamps_ns, increments, online.modes, prior, filtered, smoother_settings)
+    odometry = sequence.odometry(settings.odometry)
+
+    def smoothing(offset_s: float) -> SmootherResult:
+        motions = increments_at(drive.stamps_ns, shifted(odometry, offset_s), settings.noise)
+        return smooth(drive.stamps_ns, motions, online.modes, prior, filtered, smoother_settings)
+
+    smoothed, clock_offset_s = with_best_offset(smoothing)
     smoothing_s = time.perf_counter() - begin
     measured = sorted(online.best)
     result = RunResult(
@@ -104,7 +111,7 @@ def track(
         scans_simulated=sequence.scans_simulated,
         odometry_source=settings.odometry,
         length_m=drive.length_m,
-        log=[*_described(drive), *online.log],
+        log=[*_described(drive), *online.log, f"smoother: odometry's clock moved by {clock_offset_s:.3f} s"],
     )
     return replace(result, metrics=run_metrics(result, smoothing_s))
 
