@@ -79,7 +79,7 @@ class OdometryNoise:
         When a value is negative or not finite.
     """
 
-    longitudinal_m_per_sqrt_m: float = 0.05
+    longitudinal_m_per_sqrt_m: float = 0.1
     lateral_m_per_sqrt_m: float = 0.03
     heading_rad_per_sqrt_m: float = 0.002
     heading_rad_per_sqrt_rad: float = 0.06
