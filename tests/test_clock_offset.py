@@ -20,7 +20,7 @@ def drive(turning: float) -> Trajectory:
 
 
 def smoothed(turning: float, clock_s: float, seed: int) -> tuple[SmootherResult, float, np.ndarray]:
-    """A drive whose odometry is stamped `clock_s` too early, measured every half second, smoothed with the best offset."""
+    """A drive whose odometry is stamped `clock_s` too early, smoothed with the best offset."""
     truth = drive(turning)
     rng = np.random.default_rng(seed)
     stamps = truth.stamp_ns[20:-20:10]
