@@ -39,7 +39,7 @@ def run_table(metrics: dict[str, Any]) -> Table:
     """The methods of a run beside each other; without ground truth, a table with no lines."""
     table = Table(title=run_title(metrics), title_justify="left", box=SIMPLE_HEAD, padding=0, pad_edge=False)
     table.add_column("method", no_wrap=True)
-    for column in (*map(_stacked, ERROR_COLUMNS), "95 %\nellipse"):
+    for column in (*map(_stacked, ERROR_COLUMNS), "ell.\n95 %"):
         table.add_column(column, justify="right", no_wrap=True)
     for key, label in ROWS.items():
         if key in metrics:
