@@ -13,7 +13,8 @@ from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
-from fusion.particle_filter import ParticleFilter, ParticleFilterSettings, UpdateReport
+from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.pose_filter import PoseFilter, UpdateReport
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 
@@ -29,6 +30,7 @@ __all__ = [
     "OutlierMixture",
     "ParticleFilter",
     "ParticleFilterSettings",
+    "PoseFilter",
     "PoseLikelihood",
     "SkyfixError",
     "SmootherResult",

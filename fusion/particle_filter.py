@@ -30,6 +30,7 @@ from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.likelihood import PoseLikelihood, log_uniform_density
 from fusion.odometry import OdometryIncrement
+from fusion.pose_filter import UpdateReport
 from fusion.prior import UniformPrior
 from fusion.regularisation import matrix_root, regularised
 from fusion.resampling import RESAMPLERS, effective_sample_size
@@ -88,31 +89,6 @@ class ParticleFilterSettings:
             raise SkyfixError(
                 f"collapse_log_evidence_margin: expected a number, got {self.collapse_log_evidence_margin}"
             )
-
-
-@dataclass(frozen=True, slots=True)
-class UpdateReport:
-    """What one measurement did to the filter.
-
-    Parameters
-    ----------
-    log_evidence : float
-        ln density per m^2 rad that the measurement gave to the prediction, before normalising.
-    effective_sample_size : float
-        After weighting, before resampling.
-    resampled : bool
-        Whether the particles were resampled.
-    injected : int
-        Number of particles drawn from the likelihood.
-    lost_score : float
-        Probability of being lost after this measurement.
-    """
-
-    log_evidence: float
-    effective_sample_size: float
-    resampled: bool
-    injected: int
-    lost_score: float
 
 
 class ParticleFilter:
