@@ -13,6 +13,7 @@ from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
+from fusion.odometry_calibration import OdometryCalibration, calibrate_odometry
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.pose_filter import PoseFilter, UpdateReport
 from fusion.prior import UniformPrior
@@ -25,6 +26,7 @@ __all__ = [
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
+    "OdometryCalibration",
     "OdometryIncrement",
     "OdometryNoise",
     "OutlierMixture",
@@ -39,6 +41,7 @@ __all__ = [
     "UniformPrior",
     "UpdateReport",
     "accumulate",
+    "calibrate_odometry",
     "find_modes",
     "increments_at",
     "smooth",

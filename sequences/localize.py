@@ -13,11 +13,11 @@ from typing import Protocol
 
 import numpy as np
 
-from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
+from fusion.factor_graph import SmootherSettings, smooth
 from fusion.odometry import increments_at
+from fusion.odometry_calibration import calibrate_odometry
 from fusion.trajectory import Trajectory
 from learned.matcher import MapMatcher
-from sequences.clock_offset import shifted, with_best_offset
 from sequences.drive import Drive, load_drive, place_odometry
 from sequences.filter_pass import FilterPass
 from sequences.metrics import position_errors
@@ -83,14 +83,19 @@ def track(
     begin = time.perf_counter()
     smoother_settings = SmootherSettings(outlier_probability=settings.outlier_probability)
     odometry = sequence.odometry(settings.odometry)
-
-    def smoothing(offset_s: float) -> SmootherResult:
-        motions = increments_at(drive.stamps_ns, shifted(odometry, offset_s), settings.noise)
-        return smooth(drive.stamps_ns, motions, online.modes, prior, filtered, smoother_settings)
-
-    smoothed, clock_offset_s = with_best_offset(smoothing)
-    smoothing_s = time.perf_counter() - begin
     measured = sorted(online.best)
+    calibration = calibrate_odometry(
+        drive.stamps_ns[measured],
+        odometry,
+        settings.noise,
+        [modes for modes in online.modes if modes is not None],
+        prior,
+        filtered,
+        smoother_settings,
+    )
+    motions = increments_at(drive.stamps_ns, calibration.corrected(odometry), settings.noise)
+    smoothed = smooth(drive.stamps_ns, motions, online.modes, prior, filtered, smoother_settings)
+    smoothing_s = time.perf_counter() - begin
     result = RunResult(
         sequence_name=sequence.name,
         matcher_name=matcher.name,
@@ -111,7 +116,8 @@ def track(
         scans_simulated=sequence.scans_simulated,
         odometry_source=settings.odometry,
         length_m=drive.length_m,
-        log=[*_described(drive), *online.log, f"smoother: odometry's clock moved by {clock_offset_s:.3f} s"],
+        odometry_calibration=calibration,
+        log=[*_described(drive), *online.log],
     )
     return replace(result, metrics=run_metrics(result, smoothing_s))
 

@@ -5,6 +5,7 @@ Same sequence, settings and seed: the same content, bit for bit, but for `second
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 from fusion.trajectory import Trajectory
@@ -54,6 +55,7 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
         "frames": len(rows),
         "measured_frames": sum(row.measured for row in rows),
         "skipped_frames": sum(bool(row.skipped_reason) for row in rows),
+        "odometry_calibration": asdict(result.odometry_calibration),
         **methods,
         "seconds_per_frame": {stage: value / len(rows) for stage, value in seconds.items()},
         "realtime_factor": duration / processing,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusion.arrays import Float32Array, FloatArray
 from fusion.grid import MapGrid
+from fusion.odometry_calibration import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 from learned.map_raster import MapRaster
@@ -124,6 +125,8 @@ class RunResult:
         True when the scans were ray-cast from the map.
     length_m
         Path length of the truth, or of the odometry where there is none.
+    odometry_calibration
+        The odometry's constant errors, as the smoother found and removed them.
     log
         Lines of `log.txt`.
     """
@@ -145,4 +148,5 @@ class RunResult:
     scans_simulated: bool
     odometry_source: str
     length_m: float
+    odometry_calibration: OdometryCalibration
     log: list[str]

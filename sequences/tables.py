@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
+
+from fusion.odometry_calibration import OdometryCalibration
 
 ROWS = {
     "prior": "prior",
@@ -68,7 +71,7 @@ def run_title(metrics: dict[str, Any]) -> str:
 
 
 def closing_lines(metrics: dict[str, Any]) -> list[str]:
-    """What the table does not say: drift, skipped frames, speed."""
+    """What the table does not say: drift, the odometry's constant errors, skipped frames, speed."""
     lines = []
     if "drift" in metrics:
         drift = metrics["drift"]
@@ -79,6 +82,7 @@ def closing_lines(metrics: dict[str, Any]) -> list[str]:
         )
     else:
         lines.append("no ground truth: errors are not known")
+    lines.append(_calibration_line(OdometryCalibration(**metrics["odometry_calibration"])))
     if metrics["skipped_frames"]:
         lines.append(f"{metrics['skipped_frames']} frames were due but could not be used: see frames.csv and log.txt")
     if metrics["scans_simulated"]:
@@ -87,3 +91,11 @@ def closing_lines(metrics: dict[str, Any]) -> list[str]:
         lines.append("odometry emulated: the truth with drift added")
     lines.append(f"{metrics['realtime_factor']:.2g} times real time")
     return lines
+
+
+def _calibration_line(found: OdometryCalibration) -> str:
+    return (
+        f"smoother: moved the odometry's stamps by {found.clock_offset_s:+.2f} s and its headings by "
+        f"{found.heading_lead_s:+.2f} s and {-math.degrees(found.mount_yaw_rad):+.2f} degrees, "
+        f"stretched its distances by {100.0 * math.expm1(found.log_scale):+.1f} %"
+    )

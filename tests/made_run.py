@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 
 from fusion import se2
 from fusion.grid import MapGrid
+from fusion.odometry_calibration import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 from learned.map_raster import CLASS_INDEX, MapRaster
@@ -13,6 +16,8 @@ from sequences.metrics import drift, summarise
 from sequences.run_result import FrameRow, RunResult, Snapshot
 from sequences.start import prior_answers
 from sequences.track_settings import TrackSettings
+
+CALIBRATION = OdometryCalibration(clock_offset_s=0.1, mount_yaw_rad=-0.005, log_scale=0.01)
 
 SIGMA = np.array([0.30, 0.30, np.deg2rad(0.8)])
 """Standard deviations that the filter claims, and that its errors have."""
@@ -69,6 +74,7 @@ def made_run(frames: int = 120, *, with_truth: bool = True, snapshots: int = 6, 
         snapshots=[_snapshot(int(i), raster, truth.poses[i], tracked.poses[i], with_truth=with_truth) for i in chosen],
         metrics={
             **({**summaries, "drift": drift(truth, smoothed, odometry)} if with_truth else {}),
+            "odometry_calibration": asdict(CALIBRATION),
             "seconds_per_frame": {"predict": 4e-4, "scan": 7e-4, "match": 1e-2, "update": 3e-4, "smooth": 5e-4},
             "realtime_factor": 3.2,
         },
@@ -76,6 +82,7 @@ def made_run(frames: int = 120, *, with_truth: bool = True, snapshots: int = 6, 
         scans_simulated=True,
         odometry_source="wheels_emulated",
         length_m=truth.length_m,
+        odometry_calibration=CALIBRATION,
         log=["frame 9 (4.5 s): not measured: scan 8: expected points, got none", "<i>second line</i>"],
     )
 

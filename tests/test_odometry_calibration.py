@@ -1,0 +1,104 @@
+"""An odometry's constant errors: found where the drive shows them, left at zero where nothing does."""
+
+import numpy as np
+import pytest
+
+from fusion import GaussianMixture, OdometryNoise, Trajectory, UniformPrior, se2, smooth
+from fusion.odometry import increments_at
+from fusion.odometry_calibration import CalibrationPrior, OdometryCalibration, calibrate_odometry
+
+SECOND = 1_000_000_000
+
+
+def drive(turning: float) -> Trajectory:
+    """10 m/s for 60 s at 20 Hz, weaving with a yaw rate of so many radians a second."""
+    t = np.arange(0, 60, 0.05)
+    yaw = turning * 8.0 / (2 * np.pi) * (1 - np.cos(2 * np.pi * t / 8.0))
+    step = 0.5 * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    xy = np.concatenate([np.zeros((1, 2)), np.cumsum(0.5 * (step[:-1] + step[1:]), axis=0)])
+    return Trajectory((t * SECOND).astype(np.int64), np.column_stack([xy, yaw]))
+
+
+def with_errors(truth: Trajectory, errors: OdometryCalibration) -> Trajectory:
+    """The odometry that `errors` put right, in a frame of its own."""
+    t = truth.stamp_ns
+    inner = t[20:-20]
+    xy = truth.interpolate(inner)[:, :2] / np.exp(errors.log_scale)
+    yaw = truth.interpolate(inner + round(errors.heading_lead_s * SECOND))[:, 2] + errors.mount_yaw_rad
+    poses = se2.compose(np.array([30.0, -7.0, 1.0]), np.column_stack([xy, yaw]))
+    return Trajectory(inner - round(errors.clock_offset_s * SECOND), poses, None, "odometry")
+
+
+def calibrated(turning: float, errors: OdometryCalibration, seed: int) -> tuple[OdometryCalibration, float]:
+    """What is found from noisy positions along a drive, and the smoothed drive's mean heading error, degrees."""
+    truth = drive(turning)
+    rng = np.random.default_rng(seed)
+    stamps = truth.stamp_ns[40:-40:10]
+    poses = truth.interpolate(stamps)
+    covariance = np.diag([0.3, 0.3, np.deg2rad(1.0)]) ** 2
+    seen = [
+        GaussianMixture(np.ones(1), (pose + rng.multivariate_normal(np.zeros(3), covariance))[None], covariance[None])
+        for pose in poses
+    ]
+    odometry, noise = with_errors(truth, errors), OdometryNoise()
+    initial = Trajectory(stamps, poses, np.repeat(covariance[None], len(stamps), axis=0))
+    prior = UniformPrior(poses[0], 5.0, 0.2)
+    found = calibrate_odometry(stamps, odometry, noise, seen, prior, initial)
+    result = smooth(stamps, increments_at(stamps, found.corrected(odometry), noise), seen, prior, initial)
+    heading = np.abs(se2.wrap(result.trajectory.poses[:, 2] - poses[:, 2]))
+    return found, float(np.rad2deg(heading.mean()))
+
+
+@pytest.mark.parametrize(
+    "errors",
+    [
+        OdometryCalibration(),
+        OdometryCalibration(clock_offset_s=-0.17),
+        OdometryCalibration(clock_offset_s=0.25, mount_yaw_rad=0.02),
+        OdometryCalibration(heading_lead_s=0.2),
+        OdometryCalibration(log_scale=0.03, mount_yaw_rad=-0.01),
+        OdometryCalibration(0.1, -0.1, -0.015, -0.02),
+    ],
+    ids=["none", "clock", "clock and mounting", "heading", "scale and mounting", "all"],
+)
+def test_errors_are_found_in_turns(errors: OdometryCalibration) -> None:
+    found, heading_deg = calibrated(0.4, errors, seed=1)
+    assert found.clock_offset_s == pytest.approx(errors.clock_offset_s, abs=0.03)
+    assert found.heading_lead_s == pytest.approx(errors.heading_lead_s, abs=0.03)
+    assert found.mount_yaw_rad == pytest.approx(errors.mount_yaw_rad, abs=np.deg2rad(0.4))
+    assert found.log_scale == pytest.approx(errors.log_scale, abs=0.006)
+    assert heading_deg < 0.5
+
+
+def test_without_evidence_clocks_are_left_alone() -> None:
+    """On a straight road at constant speed no clock can be told from another."""
+    found, _ = calibrated(0.0, OdometryCalibration(clock_offset_s=0.2), seed=2)
+    assert abs(found.clock_offset_s) < 0.02
+    assert abs(found.heading_lead_s) < 0.02
+
+
+def test_corrected_undoes_the_errors() -> None:
+    """Motions of the corrected odometry are the vehicle's, inside its span and as it last moved just outside."""
+    truth, errors = drive(0.3), OdometryCalibration(0.13, 0.08, 0.05, -0.04)
+    odometry = with_errors(truth, errors)
+    corrected = errors.corrected(odometry)
+    at = truth.stamp_ns[40:-40:7]
+    moved, expected = corrected.interpolate(at), truth.interpolate(at)
+    motions = [se2.between(poses[:-1], poses[1:]) for poses in (moved, expected)]
+    np.testing.assert_allclose(motions[0], motions[1], atol=2e-3)
+    assert corrected.frame_id == "odometry"
+    first, last = corrected.span_ns
+    assert first < odometry.span_ns[0]
+    assert last > odometry.span_ns[1]
+
+
+def test_no_correction_is_none() -> None:
+    odometry = drive(0.3)
+    same = OdometryCalibration().corrected(odometry)
+    np.testing.assert_allclose(same.interpolate(odometry.stamp_ns), odometry.poses, atol=1e-12)
+
+
+def test_the_prior_is_a_gaussian_about_zero() -> None:
+    prior = CalibrationPrior(0.1, 0.2, 0.01, 0.02)
+    assert prior.cost(OdometryCalibration()) == 0.0
+    assert prior.cost(OdometryCalibration(0.2, -0.2, 0.01, 0.0)) == pytest.approx(0.5 * (4 + 1 + 1))
