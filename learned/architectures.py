@@ -12,10 +12,17 @@ from typing import Any
 from pydantic import ConfigDict, ValidationError, create_model
 
 from fusion.errors import SkyfixError
-from learned import rotmatch
+from learned import rotmatch, translocnet_matcher
 from learned.network import Architecture
 
-ARCHITECTURES: dict[str, Architecture] = {architecture.name: architecture for architecture in (rotmatch.ARCHITECTURE,)}
+ARCHITECTURES: dict[str, Architecture] = {
+    architecture.name: architecture
+    for architecture in (
+        rotmatch.ARCHITECTURE,
+        translocnet_matcher.ARCHITECTURE,
+        translocnet_matcher.COMPACT_ARCHITECTURE,
+    )
+}
 """By name."""
 
 

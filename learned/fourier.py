@@ -36,10 +36,11 @@ class FourierBranch(nn.Module):
 
     def spectrum(self, features: Tensor) -> Tensor:
         """log(1 + |FFT|), orthonormal, frequency (0, 0) first; (B, C, side, side) on the grid of frequencies."""
-        magnitude = torch.log1p(torch.fft.fft2(features.float(), norm="ortho").abs())
-        if self.pool_rotations:
-            magnitude = (magnitude.flatten(2) @ self.annulus).unflatten(2, features.shape[-2:])
-        return magnitude
+        with torch.autocast(features.device.type, enabled=False):
+            magnitude = torch.log1p(torch.fft.fft2(features.float(), norm="ortho").abs())
+            if self.pool_rotations:
+                magnitude = (magnitude.flatten(2) @ self.annulus).unflatten(2, features.shape[-2:])
+            return magnitude
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, C, side, side) -> the same shape."""

@@ -9,6 +9,7 @@ longer says where north was. Bin k of K means prior bin + k; `learned.translocne
 from __future__ import annotations
 
 import math
+
 import torch
 from torch import Tensor, nn
 
@@ -85,21 +86,22 @@ class TransLocNet(nn.Module):
         pooled = fused.mean(dim=(2, 3))
         pose: PoseMaps | DirectPose
         if self.decoder is not None and self.heads is not None:
-            pose = PoseMaps(self.decoder(fused, levels), self.heads)
+            pose = PoseMaps(self.decoder(fused, levels).float(), self.heads)
             confidence = self.confidence(torch.cat([pooled, pose.evidence()], dim=1))
         elif self.regression is not None:
             pose = DirectPose(self.regression(pooled))
             confidence = self.confidence(pooled)
-        return TransLocNetOutput(pose, map_features.mean(dim=(2, 3)), scan_features.mean(dim=(2, 3)), confidence)
+        before_map, before_scan = (features.mean(dim=(2, 3)).float() for features in (map_features, scan_features))
+        return TransLocNetOutput(pose, before_map, before_scan, confidence.float())
 
     def losses(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         """Terms of the loss; nothing in them is random."""
         self._check_scale(batch)
         output = self(batch.density, batch.picture, batch.prior_yaw)
-        embeddings = None
-        if self.scan_projection is not None and self.map_projection is not None:
-            embeddings = self.scan_projection(output.pooled_scan), self.map_projection(output.pooled_map)
         with torch.autocast(batch.density.device.type, enabled=False):
+            embeddings = None
+            if self.scan_projection is not None and self.map_projection is not None:
+                embeddings = self.scan_projection(output.pooled_scan), self.map_projection(output.pooled_map)
             return training_losses(self.settings, output, embeddings, batch)
 
     def truth_nll(self, batch: Batch, generator: torch.Generator) -> Tensor:
@@ -108,13 +110,6 @@ class TransLocNet(nn.Module):
         output = self(batch.density, batch.picture, batch.prior_yaw)
         with torch.autocast(batch.density.device.type, enabled=False):
             return true_pose_nll(self.settings, output.pose, batch)
-
-    def reaching(self, half_extent_m: float) -> TransLocNet:
-        """The same weights for scans of another reach: whatever it is, they are padded or cut to the crop."""
-        bev = replace(self.settings.bev, half_extent_m=half_extent_m)
-        net = TransLocNet(replace(self.settings, bev=bev))
-        net.load_state_dict(self.state_dict())
-        return net
 
     def scan_embedding(self, density: Tensor, prior_yaw: Tensor | None = None) -> Tensor:
         """Unit vectors (B, embedding) of scans, to be looked up among those of maps.

@@ -168,9 +168,7 @@ def _with_floor(log_density: Tensor, share: float, log_uniform: float) -> Tensor
     return torch.logaddexp(log_density + math.log1p(-share), floor)
 
 
-def _gaussian_log_density(
-    settings: TransLocNetSettings, pose: DirectPose, cells: Tensor, heading: Tensor
-) -> Tensor:
+def _gaussian_log_density(settings: TransLocNetSettings, pose: DirectPose, cells: Tensor, heading: Tensor) -> Tensor:
     metres = pose.offset_m(settings.loss.position_unit_m) - _offset_m(settings, cells)
     turn = wrapped(pose.heading() - heading)
     sigma_m, sigma_rad = settings.regression_sigma_m, math.radians(settings.regression_sigma_deg)

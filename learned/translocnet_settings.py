@@ -63,8 +63,7 @@ class LossSettings:
     def __post_init__(self) -> None:
         if min(self.regression, self.contrastive, self.confidence) < 0:
             raise SkyfixError(
-                "loss weights: expected none below 0, got "
-                f"{self.regression}, {self.contrastive} and {self.confidence}"
+                f"loss weights: expected none below 0, got {self.regression}, {self.contrastive} and {self.confidence}"
             )
         positive = (
             self.location_sigma_m, self.heading_sigma_deg, self.orientation_cells, self.position_unit_m,
