@@ -80,7 +80,7 @@ class PoseHeads(nn.Module):
 
     def __init__(self, channels: int, yaw_bins: int) -> None:
         super().__init__()
-        self.location = nn.Conv2d(channels, 1, 1)
+        self.location = nn.Conv2d(channels, 1, 1, bias=False)  # the softmax over cells would not see one
         self.orientation = nn.Linear(channels, yaw_bins)
 
     def orientation_at(self, features: Tensor, cells: Tensor) -> Tensor:

@@ -59,6 +59,7 @@ class TransLocNet(nn.Module):
         if settings.loss.contrastive > 0:
             self.map_projection = Projection(channels, settings.embedding)
             self.scan_projection = Projection(channels, settings.embedding)
+        self.to(memory_format=torch.channels_last)  # a third quicker on a CPU
 
     def forward(self, density: Tensor, picture: Tensor, prior_yaw: Tensor) -> TransLocNetOutput:
         """Compare scans with maps.
@@ -147,7 +148,8 @@ class TransLocNet(nn.Module):
 
     def _pooled(self, image: Tensor) -> Tensor:
         """Average to the network's resolution."""
-        return image if self.settings.pool == 1 else nn.functional.avg_pool2d(image, self.settings.pool)
+        pooled = image if self.settings.pool == 1 else nn.functional.avg_pool2d(image, self.settings.pool)
+        return pooled.contiguous(memory_format=torch.channels_last)
 
     def _check_scale(self, batch: Batch) -> None:
         expected = self.settings.bev.metres_per_pixel
