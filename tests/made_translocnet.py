@@ -40,10 +40,10 @@ def noise_batch(count: int = 3, settings: TransLocNetSettings = TINY, seed: int 
     return Batch(density, picture, row, col, yaw, prior_yaw)
 
 
-def landmarks(yaw: float, seed: int, crop_px: int = 64, scan_px: int = 48) -> tuple[NDArray[np.float32], ...]:
+def landmarks(yaw: float, seed: int, crop_px: int, scan_px: int) -> tuple[NDArray[np.float32], ...]:
     """Counts (4, n, n), a picture (m, m, 3) uint8 and the true (row, col) among random posts."""
     rng = np.random.default_rng(seed)
-    row, col = crop_px / 2 + rng.uniform(-7, 7, 2)
+    row, col = crop_px / 2 + rng.uniform(-crop_px / 9, crop_px / 9, 2)
     picture = np.zeros((crop_px, crop_px, 3), np.uint8)
     counts = np.zeros((4, scan_px, scan_px), np.float32)
     for _ in range(14):
@@ -56,9 +56,9 @@ def landmarks(yaw: float, seed: int, crop_px: int = 64, scan_px: int = 48) -> tu
     return counts, picture, np.array([row, col])
 
 
-def landmark_batch(yaws: list[float], prior_errors: list[float]) -> Batch:
+def landmark_batch(yaws: list[float], prior_errors: list[float], crop_px: int, scan_px: int) -> Batch:
     """One sample among landmarks for every heading (radians), each with a prior that is off by so much."""
-    made = [landmarks(yaw, seed) for seed, yaw in enumerate(yaws)]
+    made = [landmarks(yaw, seed, crop_px, scan_px) for seed, yaw in enumerate(yaws)]
     density = torch.from_numpy(np.stack([log_density(counts) for counts, _, _ in made]))
     picture = torch.stack([picture_tensor(picture) for _, picture, _ in made])
     row, col = torch.from_numpy(np.stack([place for _, _, place in made])).T

@@ -252,4 +252,4 @@ def test_features_are_as_fine_as_the_map() -> None:
     net, batch = TransLocNet(replace(TINY, pool=2, crop_px=128)), noise_batch(2, replace(TINY, crop_px=128))
     pose = net(batch.density, batch.picture, batch.prior_yaw).pose
     assert isinstance(pose, PoseMaps)
-    assert pose.log_location().shape == (2, 64, 64)
+    assert pose.log_location.shape == (2, 64, 64)

@@ -33,7 +33,7 @@ def maps_of(location: torch.Tensor, orientation: torch.Tensor) -> PoseMaps:
         heads.location.weight[0, 0] = 1.0
         heads.orientation.bias.zero_()
         heads.orientation.weight.copy_(torch.cat([torch.zeros(bins, 1), torch.eye(bins)], dim=1))
-    return PoseMaps(torch.cat([location[:, None], orientation], dim=1), heads)
+    return PoseMaps.of(torch.cat([location[:, None], orientation], dim=1), heads)
 
 
 def test_sparse_orientation_is_dense_orientation() -> None:
@@ -43,7 +43,7 @@ def test_sparse_orientation_is_dense_orientation() -> None:
     pose = net(batch.density, batch.picture, batch.prior_yaw).pose
     assert isinstance(pose, PoseMaps)
     share = location_target(truth_in_cells(settings, batch), 64, 1.0 / 0.5)
-    logits = pose.heads.orientation(pose.features.permute(0, 2, 3, 1))  # every cell
+    logits = pose.heads.orientation(pose.features)  # every cell
     target = heading_target(relative_heading(settings, batch), 72, 2.5)
     dense = -(share.view(2, 64, 64) * (logits.log_softmax(-1) * target[:, None, None, :]).sum(-1)).sum((1, 2)).mean()
     torch.testing.assert_close(net.losses(batch, torch.Generator())["orientation"], dense)

@@ -15,6 +15,7 @@ from fusion import se2
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from learned.architectures import ARCHITECTURES
+from learned.bev import BevSettings
 from learned.calibration import Calibration
 from learned.checkpoint import load_checkpoint, save_network
 from learned.map_raster import MapRaster
@@ -178,8 +179,7 @@ def test_checkpoints_come_back(tmp_path: Path) -> None:
         assert again.error_correlation_length_m == 8.0
         search = SearchRegion(np.array([146.0, 8.0, 1.0]), 5.0, 0.2)
         first, second = (
-            m.match(scan_of(), -1.7, city(), search)
-            for m in (architecture.matcher(net, Calibration(1.3, 8.0)), again)
+            m.match(scan_of(), -1.7, city(), search) for m in (architecture.matcher(net, Calibration(1.3, 8.0)), again)
         )
         np.testing.assert_allclose(first.log_prob, second.log_prob, atol=1e-5)
 
@@ -195,27 +195,28 @@ def test_bad_requests_are_one_line() -> None:
 
 
 def test_it_learns_a_handful_of_samples_with_headings_in_all_quadrants() -> None:
-    """Slow for a test (about half a minute): trained on truths in pixels, asked in metres of a map elsewhere."""
+    """The slow test here (ten seconds of one core): trained on truths in pixels, asked in metres of another frame."""
     yaws = [math.radians(d) for d in (25.0, 115.0, -155.0, -65.0)]
     errors = [math.radians(d) for d in (7.0, -8.0, 5.0, -3.0)]
-    settings = replace(TINY, yaw_bins=360)
+    settings = replace(TINY, bev=BevSettings(6.0, 0.5), crop_px=32, yaw_bins=360)
     torch.manual_seed(0)
-    net, batch = TransLocNet(settings), landmark_batch(yaws, errors)
-    optimizer = torch.optim.Adam(net.parameters(), 3e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 5e-3, total_steps=220)
+    net, batch = TransLocNet(settings), landmark_batch(yaws, errors, 32, 24)
+    optimizer = torch.optim.Adam(net.parameters())
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-2, total_steps=120)
     generator = torch.Generator().manual_seed(0)
-    for _ in range(220):
+    for _ in range(120):
         optimizer.zero_grad()
         net.losses(batch, generator)["total"].backward()
         optimizer.step()
         schedule.step()
     matcher = TransLocNetMatcher(net)
+    grid = MapGrid(32, 32, 0.5, 1000.0, -500.0)
     for seed, (yaw, error) in enumerate(zip(yaws, errors, strict=True)):
-        counts, picture, (row, col) = landmarks(yaw, seed)
-        grid = MapGrid(64, 64, 0.5, 1000.0, -500.0)
-        search = SearchRegion(np.array([*grid.centre_xy, yaw + error]), 12.0, math.radians(12))
+        counts, picture, (row, col) = landmarks(yaw, seed, 32, 24)
+        search = SearchRegion(np.array([*grid.centre_xy, yaw + error]), 7.0, math.radians(12))
         volume = matcher.match_counts(counts, MapRaster(grid, None, picture), search)
         found, truth = volume.modes(1).means[0], np.array([*grid.xy_from_pixel([row, col]), yaw])
         assert np.hypot(*(found - truth)[:2]) < 0.5
         assert abs(se2.wrap(found[2] - yaw)) < math.radians(1.0)
-        assert matcher.net.truth_nll(batch, generator)[seed] < 0.0  # uniform: 8.8
+    with torch.no_grad():
+        assert float(net.truth_nll(batch, generator).max()) < 2.0  # of a uniform density: 7.4
