@@ -195,16 +195,16 @@ def test_bad_requests_are_one_line() -> None:
 
 
 def test_it_learns_a_handful_of_samples_with_headings_in_all_quadrants() -> None:
-    """The slow test here (ten seconds of one core): trained on truths in pixels, asked in metres of another frame."""
+    """The slow test here (fifteen seconds of one core): trained on truths in pixels, asked in metres of another frame."""
     yaws = [math.radians(d) for d in (25.0, 115.0, -155.0, -65.0)]
     errors = [math.radians(d) for d in (7.0, -8.0, 5.0, -3.0)]
     settings = replace(TINY, bev=BevSettings(6.0, 0.5), crop_px=32, yaw_bins=360)
-    torch.manual_seed(0)
+    torch.manual_seed(1)
     net, batch = TransLocNet(settings), landmark_batch(yaws, errors, 32, 24)
     optimizer = torch.optim.Adam(net.parameters())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-2, total_steps=120)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-2, total_steps=160)
     generator = torch.Generator().manual_seed(0)
-    for _ in range(120):
+    for _ in range(160):
         optimizer.zero_grad()
         net.losses(batch, generator)["total"].backward()
         optimizer.step()
@@ -219,4 +219,4 @@ def test_it_learns_a_handful_of_samples_with_headings_in_all_quadrants() -> None
         assert np.hypot(*(found - truth)[:2]) < 0.5
         assert abs(se2.wrap(found[2] - yaw)) < math.radians(1.0)
     with torch.no_grad():
-        assert float(net.truth_nll(batch, generator).max()) < 2.0  # of a uniform density: 7.4
+        assert float(net.truth_nll(batch, generator).max()) < 1.0  # of a uniform density: 7.4
