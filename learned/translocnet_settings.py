@@ -110,7 +110,7 @@ class TransLocNetSettings:
     backbone: BackboneSettings = field(default_factory=BackboneSettings)
     channels: int = 128
     heads: int = 4
-    decoder_widths: tuple[int, int, int, int] = (64, 64, 64, 32)
+    decoder_widths: tuple[int, int, int, int] = (80, 64, 40, 32)
     yaw_bins: int = 360
     embedding: int = 64
     cross_attention: bool = True

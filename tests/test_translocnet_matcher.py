@@ -195,7 +195,7 @@ def test_bad_requests_are_one_line() -> None:
 
 
 def test_it_learns_a_handful_of_samples_with_headings_in_all_quadrants() -> None:
-    """The slow test here (fifteen seconds of one core): trained on truths in pixels, asked in metres of another frame."""
+    """The slow test here (15 s of one core): trained on truths in pixels, asked in metres of another frame."""
     yaws = [math.radians(d) for d in (25.0, 115.0, -155.0, -65.0)]
     errors = [math.radians(d) for d in (7.0, -8.0, 5.0, -3.0)]
     settings = replace(TINY, bev=BevSettings(6.0, 0.5), crop_px=32, yaw_bins=360)
