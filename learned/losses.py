@@ -56,7 +56,7 @@ def truth_nll(
         Size of a feature cell.
     """
     row, col, yaw = truth
-    yaws, widths = quadrature.draw(yaw, generator)
+    yaws, widths = (drawn.to(scan_features.device) for drawn in quadrature.draw(yaw, generator))
     scores = vote(map_features, scan_features, yaws, chunk=len(yaws))
     log_cell = torch.log(widths) + 2 * math.log(metres_per_cell)
     normaliser = torch.logsumexp(scores.flatten(1) + log_cell[:, None], dim=(0, 1))

@@ -8,8 +8,7 @@ chosen for two CPU cores.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -18,28 +17,32 @@ from typing import Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from fusion.errors import SkyfixError
 from fusion.likelihood import LikelihoodVolume
 from learned.bev import BANDS_M, BevSettings, bev_counts, log_density
+from learned.calibration import Calibration
+from learned.checkpoint import load_network, save_network
+from learned.losses import HeadingQuadrature, truth_nll
 from learned.map_raster import MapRaster
 from learned.matcher import SearchRegion, matching_window
+from learned.network import Architecture, Batch, picture_tensor
 from learned.voting import bin_yaws, volume_from_scores, vote, yaw_bins_within
 
-ARCHITECTURE = "rotmatch-1"
 STRIDE = 2
 
 
 @dataclass(frozen=True, slots=True)
 class RotMatchSettings:
-    """Sizes: features a cell, widths of the U-Nets' levels (strides 2, 4, 8, 16), extent of the scan's image."""
+    """Sizes: features a cell, widths of the U-Nets' levels (strides 2, 4, 8, 16), extent of the scan's image.
+
+    `quadrature` says at which headings the training's likelihood is evaluated.
+    """
 
     channels: int = 8
     widths: tuple[int, int, int, int] = (16, 32, 48, 64)
     bev: BevSettings = field(default_factory=BevSettings)
+    quadrature: HeadingQuadrature = field(default_factory=HeadingQuadrature)
 
 
 class _Block(nn.Sequential):
@@ -79,7 +82,7 @@ class FeatureNet(nn.Module):
 
 
 class RotMatchNet(nn.Module):
-    """The two encoders and the scale of the score."""
+    """The two encoders and the scale of the score; implements `learned.network.LocalizationNet`."""
 
     def __init__(self, settings: RotMatchSettings) -> None:
         super().__init__()
@@ -108,21 +111,23 @@ class RotMatchNet(nn.Module):
         """(B, 3, H, W) in [0, 1] -> (B, C, H / 2, W / 2) unit vectors."""
         return nn.functional.normalize(self.map_encoder(picture), dim=1)
 
+    def losses(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
+        """Mean negative log density of the true poses."""
+        return {"total": self.truth_nll(batch, generator).mean()}
 
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """What is fitted on held-out data after training.
-
-    Attributes
-    ----------
-    temperature
-        Divides the scores.
-    error_correlation_length_m
-        Distance over which the errors of neighbouring frames decorrelate (1/e).
-    """
-
-    temperature: float = 1.0
-    error_correlation_length_m: float = 6.0
+    def truth_nll(self, batch: Batch, generator: torch.Generator) -> Tensor:
+        """(B,) negative log density (per m^2 rad) of the true poses, all headings searched."""
+        scans, maps = self.scan_features(batch.density), self.map_features(batch.picture)
+        truths = torch.stack([batch.row / STRIDE, batch.col / STRIDE, batch.yaw], dim=1).tolist()
+        cell, quadrature = self.settings.bev.metres_per_pixel * STRIDE, self.settings.quadrature
+        for _ in range(batch.first):
+            quadrature.draw(0.0, generator)
+        with torch.autocast(scans.device.type, enabled=False):
+            losses = [
+                truth_nll(m, s, (row, col, yaw), cell, quadrature, generator)
+                for m, s, (row, col, yaw) in zip(maps.float(), scans.float(), truths, strict=True)
+            ]
+        return torch.stack(losses)
 
 
 class RotMatch:
@@ -183,48 +188,13 @@ class RotMatch:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a checkpoint: weights in PATH (.safetensors), sizes and calibration in the .json beside it.
-
-        Raises
-        ------
-        SkyfixError
-            If a file is missing or unreadable, or was written for another architecture or other sizes.
-        """
-        sidecar = path.with_suffix(".json")
-        for file in (path, sidecar):
-            if not file.is_file():
-                raise SkyfixError(f"checkpoint: expected {file.name} at {file.parent}, got no such file")
-        try:
-            facts = json.loads(sidecar.read_text())
-            architecture = facts["architecture"]
-            if architecture != ARCHITECTURE:
-                raise SkyfixError(f"checkpoint {path.name}: expected architecture {ARCHITECTURE}, got {architecture}")
-            sizes = facts["settings"]
-            settings = RotMatchSettings(sizes["channels"], tuple(sizes["widths"]), BevSettings(**sizes["bev"]))
-            calibration = Calibration(**facts["calibration"])
-            net = RotMatchNet(settings)
-            net.load_state_dict(load_file(path))
-        except (json.JSONDecodeError, KeyError, TypeError, SafetensorError) as error:
-            raise SkyfixError(f"checkpoint {path.name}: expected a readable checkpoint, got {error!r}") from error
-        except RuntimeError as error:
-            what = str(error).splitlines()[-1].strip()
-            raise SkyfixError(f"checkpoint {path.name}: its weights do not fit its stated sizes: {what}") from error
+        """Read a checkpoint of this architecture; see `learned.checkpoint.load_network`."""
+        net, calibration = load_network(path, ARCHITECTURE)
         return cls(net, calibration)
 
     def save(self, path: Path, provenance: dict[str, object]) -> None:
-        """Write PATH (.safetensors) and the .json beside it; `provenance`: data, seed and command."""
-        facts = {
-            "architecture": ARCHITECTURE,
-            "settings": asdict(self.net.settings),
-            "calibration": asdict(self.calibration),
-            "parameters": sum(p.numel() for p in self.net.parameters()),
-            **provenance,
-        }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_file({name: tensor.contiguous() for name, tensor in self.net.state_dict().items()}, path)
-        path.with_suffix(".json").write_text(json.dumps(facts, indent=2) + "\n")
+        """Write PATH (.safetensors) and the .json beside it; see `learned.checkpoint.save_network`."""
+        save_network(path, ARCHITECTURE, self.net, self.calibration, provenance)
 
 
-def picture_tensor(picture: NDArray[np.uint8]) -> Tensor:
-    """(rows, cols, 3) uint8 -> (3, rows, cols) float32 in [0, 1]."""
-    return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float() / 255.0
+ARCHITECTURE = Architecture("rotmatch", RotMatchSettings, RotMatchNet, RotMatch, RotMatchNet.reaching)
