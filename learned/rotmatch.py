@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
-from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
@@ -25,12 +24,13 @@ from torch import Tensor, nn
 from fusion.errors import SkyfixError
 from fusion.likelihood import LikelihoodVolume
 from learned.bev import BANDS_M, BevSettings, bev_counts, log_density
+from learned.feature_net import STEM_STRIDE, FeatureNet
 from learned.map_raster import MapRaster
 from learned.matcher import SearchRegion, matching_window
 from learned.voting import bin_yaws, volume_from_scores, vote, yaw_bins_within
 
 ARCHITECTURE = "rotmatch-1"
-STRIDE = 2
+STRIDE = STEM_STRIDE
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,42 +40,6 @@ class RotMatchSettings:
     channels: int = 8
     widths: tuple[int, int, int, int] = (16, 32, 48, 64)
     bev: BevSettings = field(default_factory=BevSettings)
-
-
-class _Block(nn.Sequential):
-    """Convolution, group normalisation, ReLU. Even kernels keep a stride of 2 centred, so turning commutes with it."""
-
-    def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
-        super().__init__(
-            nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=(kernel - stride + 1) // 2, bias=False),
-            nn.GroupNorm(4, outputs),
-            nn.ReLU(inplace=True),
-        )
-
-
-class FeatureNet(nn.Module):
-    """A small U-Net: (B, inputs, H, W) -> (B, outputs, H / 2, W / 2), receptive field about the whole image."""
-
-    def __init__(self, inputs: int, outputs: int, widths: tuple[int, int, int, int]) -> None:
-        super().__init__()
-        self.stem = nn.Sequential(_Block(inputs, widths[0], kernel=6, stride=STRIDE), _Block(widths[0], widths[0]))
-        pairs = list(pairwise(widths))
-        self.down = nn.ModuleList([nn.Sequential(_Block(a, b, kernel=4, stride=2), _Block(b, b)) for a, b in pairs])
-        self.lateral = nn.ModuleList([nn.Conv2d(b, a, 1) for a, b in pairs])
-        self.up = nn.ModuleList([_Block(a, a) for a, _ in pairs])
-        self.head = nn.Conv2d(widths[0], outputs, 1)
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Features at half the resolution of the image."""
-        levels = [self.stem(image)]
-        for down in self.down:
-            levels.append(down(levels[-1]))
-        x = levels.pop()
-        for lateral, up in zip(reversed(self.lateral), reversed(self.up), strict=True):
-            skip = levels.pop()
-            coarse = nn.functional.interpolate(lateral(x), size=skip.shape[-2:], mode="bilinear", align_corners=False)
-            x = up(skip + coarse)
-        return self.head(x)
 
 
 class RotMatchNet(nn.Module):
