@@ -8,6 +8,7 @@ ICML 2017, section 4.2), puts them right.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -22,6 +23,22 @@ from learned.matcher import SearchRegion
 from learned.samples import SAMPLE_METRES_PER_PIXEL, Sample
 
 _LOG_TEMPERATURE_BOUNDS = (np.log(0.05), np.log(50.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What is fitted on held-out data after training.
+
+    Attributes
+    ----------
+    temperature
+        Divides the scores.
+    error_correlation_length_m
+        Distance over which the errors of neighbouring frames decorrelate (1/e).
+    """
+
+    temperature: float = 1.0
+    error_correlation_length_m: float = 6.0
 
 
 class CountsMatcher(Protocol):

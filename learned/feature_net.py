@@ -42,23 +42,32 @@ class Pyramid(nn.Module):
         stem = ConvBlock(inputs, widths[0], kernel=6, stride=STEM_STRIDE)
         self.stem = nn.Sequential(stem, ConvBlock(widths[0], widths[0]))
         pairs = list(pairwise(widths))
-        self.down = nn.ModuleList([nn.Sequential(ConvBlock(a, b, kernel=4, stride=2), ConvBlock(b, b)) for a, b in pairs])
+        self.down = nn.ModuleList(
+            [nn.Sequential(ConvBlock(a, b, kernel=4, stride=2), ConvBlock(b, b)) for a, b in pairs]
+        )
         self.lateral = nn.ModuleList([nn.Conv2d(b, a, 1) for a, b in pairs[finest:]])
         self.up = nn.ModuleList([ConvBlock(a, a) for a, _ in pairs[finest:]])
 
-    def levels(self, image: Tensor) -> list[Tensor]:
-        """Decoded features (B, widths[k], H / 2^(k + 1), W / 2^(k + 1)) of the levels k, the finest first."""
+    def encode(self, image: Tensor) -> list[Tensor]:
+        """Encoded features (B, widths[k], H / 2^(k + 1), W / 2^(k + 1)) of all levels k, the finest first."""
         encoded = [self.stem(image)]
         for down in self.down:
             encoded.append(down(encoded[-1]))
-        x = encoded.pop()
+        return encoded
+
+    def decode(self, encoded: list[Tensor]) -> list[Tensor]:
+        """Decoded features of the levels from `finest` on, the finest first; the last is the last encoded."""
+        x, *skips = encoded[::-1]
         decoded = [x]
-        for lateral, up in zip(reversed(self.lateral), reversed(self.up), strict=True):
-            skip = encoded.pop()
+        for lateral, up, skip in zip(reversed(self.lateral), reversed(self.up), skips, strict=False):
             coarse = nn.functional.interpolate(lateral(x), size=skip.shape[-2:], mode="bilinear", align_corners=False)
             x = up(skip + coarse)
             decoded.append(x)
         return decoded[::-1]
+
+    def levels(self, image: Tensor) -> list[Tensor]:
+        """Decoded features of an image (B, inputs, H, W)."""
+        return self.decode(self.encode(image))
 
 
 class FeatureNet(Pyramid):

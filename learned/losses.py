@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from learned.voting import vote
-
 
 @dataclass(frozen=True, slots=True)
 class HeadingQuadrature:
@@ -34,32 +32,6 @@ class HeadingQuadrature:
         coarse = fine[-1] + step / 2 + (torch.arange(self.coarse) + phase_coarse) * wide
         widths = torch.cat([torch.full((self.fine,), step), torch.full((self.coarse,), wide)])
         return torch.cat([fine, coarse]), widths
-
-
-def truth_nll(
-    map_features: Tensor,
-    scan_features: Tensor,
-    truth: tuple[float, float, float],
-    metres_per_cell: float,
-    quadrature: HeadingQuadrature,
-    generator: torch.Generator,
-) -> Tensor:
-    """Negative log density (per m^2 rad) of the true pose under the voted volume.
-
-    Parameters
-    ----------
-    map_features, scan_features
-        (C, H, W) and (C, n, n), on the same cell size.
-    truth
-        Row and column (continuous, in feature cells of the map, integers at edges) and yaw (radians).
-    metres_per_cell
-        Size of a feature cell.
-    """
-    row, col, yaw = truth
-    yaws, widths = quadrature.draw(yaw, generator)
-    scores = vote(map_features, scan_features, yaws, chunk=len(yaws))
-    half = scan_features.shape[-1] / 2
-    return scores_nll(scores, (row - half, col - half, yaw), yaws, widths, metres_per_cell, quadrature)
 
 
 def scores_nll(

@@ -100,11 +100,14 @@ def matching_window(
 def load_matcher(name_or_path: str) -> MapMatcher:
     """Load a matcher: 'rotmatch' (the shipped weights), 'geometric' (no learning) or a path (.safetensors).
 
+    A checkpoint's .json says which network it is of, see `learned.checkpoint.load_checkpoint`.
+
     Raises
     ------
     SkyfixError
         If the name is unknown, the file is missing, or the checkpoint does not match this version's network.
     """
+    from learned.checkpoint import load_checkpoint
     from learned.geometric import GeometricMatcher
     from learned.rotmatch import RotMatch
 
@@ -114,5 +117,5 @@ def load_matcher(name_or_path: str) -> MapMatcher:
         return RotMatch.shipped()
     path = Path(name_or_path)
     if path.suffix == ".safetensors":
-        return RotMatch.load(path)
+        return load_checkpoint(path)
     raise SkyfixError(f"matcher: expected 'rotmatch', 'geometric' or a .safetensors file, got {name_or_path!r}")

@@ -95,19 +95,19 @@ class OrienterNet(VotingNet):
         return VotingFeatures(view * confidence * (self.log_scale.exp() / cells), neural_map, prior)
 
     def reaching(self, half_extent_m: float) -> OrienterNet:
-        """The same weights for a scan image of another extent; the average becomes one over its cells."""
+        """The same weights for a scan image of another extent, with a cell's vote worth what it was."""
         net = OrienterNet(replace(self.settings, bev=replace(self.bev, half_extent_m=half_extent_m)))
         net.load_state_dict(self.state_dict())
+        with torch.no_grad():
+            net.log_scale.add_(2 * math.log(net.bev.size / self.bev.size))
         return net
 
 
-class OrienterNetMatcher(VotingMatcher):
+class OrienterNetMatcher(VotingMatcher[OrienterNet]):
     """OrienterNet as a measurement model."""
 
     def __init__(self, net: OrienterNet, calibration: Calibration | None = None, yaw_bins: int = 360) -> None:
         super().__init__("orienternet", net, calibration, yaw_bins)
 
 
-ARCHITECTURE = Architecture(
-    "orienternet", OrienterNetSettings, OrienterNet, OrienterNetMatcher, OrienterNet.reaching
-)
+ARCHITECTURE = Architecture("orienternet", OrienterNetSettings, OrienterNet, OrienterNetMatcher, OrienterNet.reaching)

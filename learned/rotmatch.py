@@ -8,45 +8,43 @@ chosen for two CPU cores.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Self
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from fusion.errors import SkyfixError
-from fusion.likelihood import LikelihoodVolume
-from learned.bev import BANDS_M, BevSettings, bev_counts, log_density
+from learned.bev import BANDS_M, BevSettings
+from learned.calibration import Calibration
+from learned.checkpoint import load_network, save_network
 from learned.feature_net import STEM_STRIDE, FeatureNet
-from learned.map_raster import MapRaster
-from learned.matcher import SearchRegion, matching_window
-from learned.voting import bin_yaws, volume_from_scores, vote, yaw_bins_within
+from learned.losses import HeadingQuadrature
+from learned.network import Architecture
+from learned.voting_net import VotingFeatures, VotingMatcher, VotingNet, check_images
 
-ARCHITECTURE = "rotmatch-1"
 STRIDE = STEM_STRIDE
 
 
 @dataclass(frozen=True, slots=True)
 class RotMatchSettings:
-    """Sizes: features a cell, widths of the U-Nets' levels (strides 2, 4, 8, 16), extent of the scan's image."""
+    """Sizes: features a cell, widths of the U-Nets' levels (strides 2, 4, 8, 16), extent of the scan's image.
+
+    `quadrature` says at which headings the training's likelihood is evaluated.
+    """
 
     channels: int = 8
     widths: tuple[int, int, int, int] = (16, 32, 48, 64)
     bev: BevSettings = field(default_factory=BevSettings)
+    quadrature: HeadingQuadrature = field(default_factory=HeadingQuadrature)
 
 
-class RotMatchNet(nn.Module):
-    """The two encoders and the scale of the score."""
+class RotMatchNet(VotingNet):
+    """The two encoders and the scale of the score; implements `learned.network.LocalizationNet`."""
 
     def __init__(self, settings: RotMatchSettings) -> None:
-        super().__init__()
+        super().__init__(settings.bev, STRIDE, settings.quadrature)
         self.settings = settings
         self.scan_encoder = FeatureNet(len(BANDS_M), settings.channels + 1, settings.widths)
         self.map_encoder = FeatureNet(3, settings.channels, settings.widths)
@@ -72,72 +70,17 @@ class RotMatchNet(nn.Module):
         """(B, 3, H, W) in [0, 1] -> (B, C, H / 2, W / 2) unit vectors."""
         return nn.functional.normalize(self.map_encoder(picture), dim=1)
 
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """What is fitted on held-out data after training.
-
-    Attributes
-    ----------
-    temperature
-        Divides the scores.
-    error_correlation_length_m
-        Distance over which the errors of neighbouring frames decorrelate (1/e).
-    """
-
-    temperature: float = 1.0
-    error_correlation_length_m: float = 6.0
+    def features(self, density: Tensor, picture: Tensor) -> VotingFeatures:
+        """Both feature images; no prior."""
+        check_images(density, picture, self.bev)
+        return VotingFeatures(self.scan_features(density), self.map_features(picture))
 
 
-class RotMatch:
-    """RotMatch as a measurement model; implements `learned.matcher.MapMatcher`.
-
-    Parameters
-    ----------
-    net
-        The encoders.
-    calibration
-        Temperature and error correlation, from held-out data.
-    yaw_bins
-        Heading bins over the full circle (360: 1 degree each).
-    """
+class RotMatch(VotingMatcher[RotMatchNet]):
+    """RotMatch as a measurement model; see `learned.voting_net.VotingMatcher`."""
 
     def __init__(self, net: RotMatchNet, calibration: Calibration | None = None, yaw_bins: int = 360) -> None:
-        self.net = net.eval()
-        self.calibration = calibration or Calibration()
-        self.yaw_bins = yaw_bins
-
-    @property
-    def name(self) -> str:
-        """Short name for tables."""
-        return "rotmatch"
-
-    @property
-    def error_correlation_length_m(self) -> float:
-        """Distance over which errors decorrelate, metres."""
-        return self.calibration.error_correlation_length_m
-
-    def match(
-        self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
-    ) -> LikelihoodVolume:
-        """Likelihood of the poses in the search region; see `learned.matcher.MapMatcher.match`."""
-        return self.match_counts(bev_counts(points, ground_z, self.net.settings.bev), map_raster, search)
-
-    def match_counts(
-        self, counts: NDArray[np.float32], map_raster: MapRaster, search: SearchRegion
-    ) -> LikelihoodVolume:
-        """Match a bird's-eye view (bands, n, n) that has been made already."""
-        bev = self.net.settings.bev
-        reach = bev.size / 2 * bev.metres_per_pixel
-        crop = map_raster.resampled(matching_window(map_raster, search, reach, bev.metres_per_pixel, multiple_of=16))
-        bins = yaw_bins_within(float(search.centre[2]), search.half_heading_rad, self.yaw_bins)
-        density = torch.from_numpy(log_density(counts))
-        picture = picture_tensor(crop.picture)
-        with torch.inference_mode():
-            scan = self.net.scan_features(density[None])[0]
-            features = self.net.map_features(picture[None])[0]
-            scores = vote(features, scan, bin_yaws(bins, self.yaw_bins)) / self.calibration.temperature
-        return volume_from_scores(scores, bins, self.yaw_bins, crop.grid, STRIDE)
+        super().__init__("rotmatch", net, calibration, yaw_bins)
 
     @classmethod
     def shipped(cls) -> Self:
@@ -147,48 +90,13 @@ class RotMatch:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a checkpoint: weights in PATH (.safetensors), sizes and calibration in the .json beside it.
-
-        Raises
-        ------
-        SkyfixError
-            If a file is missing or unreadable, or was written for another architecture or other sizes.
-        """
-        sidecar = path.with_suffix(".json")
-        for file in (path, sidecar):
-            if not file.is_file():
-                raise SkyfixError(f"checkpoint: expected {file.name} at {file.parent}, got no such file")
-        try:
-            facts = json.loads(sidecar.read_text())
-            architecture = facts["architecture"]
-            if architecture != ARCHITECTURE:
-                raise SkyfixError(f"checkpoint {path.name}: expected architecture {ARCHITECTURE}, got {architecture}")
-            sizes = facts["settings"]
-            settings = RotMatchSettings(sizes["channels"], tuple(sizes["widths"]), BevSettings(**sizes["bev"]))
-            calibration = Calibration(**facts["calibration"])
-            net = RotMatchNet(settings)
-            net.load_state_dict(load_file(path))
-        except (json.JSONDecodeError, KeyError, TypeError, SafetensorError) as error:
-            raise SkyfixError(f"checkpoint {path.name}: expected a readable checkpoint, got {error!r}") from error
-        except RuntimeError as error:
-            what = str(error).splitlines()[-1].strip()
-            raise SkyfixError(f"checkpoint {path.name}: its weights do not fit its stated sizes: {what}") from error
+        """Read a checkpoint of this architecture; see `learned.checkpoint.load_network`."""
+        net, calibration = load_network(path, ARCHITECTURE)
         return cls(net, calibration)
 
     def save(self, path: Path, provenance: dict[str, object]) -> None:
-        """Write PATH (.safetensors) and the .json beside it; `provenance`: data, seed and command."""
-        facts = {
-            "architecture": ARCHITECTURE,
-            "settings": asdict(self.net.settings),
-            "calibration": asdict(self.calibration),
-            "parameters": sum(p.numel() for p in self.net.parameters()),
-            **provenance,
-        }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_file({name: tensor.contiguous() for name, tensor in self.net.state_dict().items()}, path)
-        path.with_suffix(".json").write_text(json.dumps(facts, indent=2) + "\n")
+        """Write PATH (.safetensors) and the .json beside it; see `learned.checkpoint.save_network`."""
+        save_network(path, ARCHITECTURE, self.net, self.calibration, provenance)
 
 
-def picture_tensor(picture: NDArray[np.uint8]) -> Tensor:
-    """(rows, cols, 3) uint8 -> (3, rows, cols) float32 in [0, 1]."""
-    return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float() / 255.0
+ARCHITECTURE = Architecture("rotmatch", RotMatchSettings, RotMatchNet, RotMatch, RotMatchNet.reaching)

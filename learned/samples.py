@@ -51,7 +51,23 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Augmentation:
-    """How samples are varied; probabilities apply to each sample."""
+    """How samples are varied; probabilities apply to each sample.
+
+    Attributes
+    ----------
+    max_offset_px, crop_px
+        The crop's side, and how far its middle lies from the vehicle at most.
+    drop_class
+        Probability that a group of classes is blanked on the map.
+    thin, shorten, drop_sector, drop_band
+        Probabilities of each impoverishment of the scan.
+    half_heading_deg
+        The heading known beforehand is uniform within this of the truth; 180: unknown.
+    rotate, rotate_deg
+        Probability that the map is turned about the vehicle, by an angle uniform within +-rotate_deg.
+    colour_jitter
+        Brightness, contrast and saturation of the picture are scaled by factors uniform in 1 +- this.
+    """
 
     max_offset_px: int = 40
     crop_px: int = 256
@@ -60,6 +76,10 @@ class Augmentation:
     shorten: float = 0.2
     drop_sector: float = 0.15
     drop_band: float = 0.1
+    half_heading_deg: float = 180.0
+    rotate: float = 0.0
+    rotate_deg: float = 60.0
+    colour_jitter: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +94,8 @@ class Example:
         (crop, crop, 3) uint8.
     row, col, yaw
         The truth in the crop: continuous pixel coordinates, radians.
+    prior_yaw
+        The heading that is known beforehand, radians.
     """
 
     density: NDArray[np.float32]
@@ -81,6 +103,7 @@ class Example:
     row: float
     col: float
     yaw: float
+    prior_yaw: float
 
 
 def augment(sample: Sample, rng: np.random.Generator, settings: Augmentation) -> Example:
@@ -96,24 +119,50 @@ def augment(sample: Sample, rng: np.random.Generator, settings: Augmentation) ->
     offset = rng.integers(-settings.max_offset_px, settings.max_offset_px + 1, size=2)
     top, left = (round(v) - settings.crop_px // 2 + int(d) for v, d in zip((row, col), offset, strict=True))
     top, left = (min(max(v, 0), size - settings.crop_px) for v in (top, left))
-    crop = classes[top : top + settings.crop_px, left : left + settings.crop_px]
-    return Example(
-        log_density(_impoverish_scan(counts.astype(np.float32), rng, settings)),
-        PALETTE[_drop_classes(crop, rng, settings.drop_class)],
-        row - top,
-        col - left,
-        float(se2.wrap(yaw)),
-    )
+    density = log_density(_impoverish_scan(counts.astype(np.float32), rng, settings))
+    kept = _kept_classes(rng, settings.drop_class)
+    # Draws above make up what networks were trained on: new ones go below, so that old runs can be made again.
+    prior_yaw = yaw + rng.uniform(-1.0, 1.0) * math.radians(settings.half_heading_deg)
+    if settings.rotate > 0 and rng.random() < settings.rotate:
+        angle = rng.uniform(-1.0, 1.0) * math.radians(settings.rotate_deg)
+        classes, yaw, prior_yaw = _turn_about(classes, row, col, angle), yaw + angle, prior_yaw + angle
+    picture = PALETTE[kept[classes[top : top + settings.crop_px, left : left + settings.crop_px]]]
+    if settings.colour_jitter > 0:
+        picture = _jitter_colours(picture, rng, settings.colour_jitter)
+    return Example(density, picture, row - top, col - left, float(se2.wrap(yaw)), float(se2.wrap(prior_yaw)))
 
 
-def _drop_classes(crop: NDArray[np.uint8], rng: np.random.Generator, probability: float) -> NDArray[np.uint8]:
-    """Blank whole groups of classes, so that no class is relied upon alone; always the same number of draws."""
+def _turn_about(classes: NDArray[np.uint8], row: float, col: float, angle: float) -> NDArray[np.uint8]:
+    """Turn a class raster counter-clockwise about a point, nearest cell; what turns in from outside is void."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    turned = np.array([[cos, sin], [-sin, cos]])  # in image axes (x right, y down) a turn to the left has this sign
+    centre = np.array([col - 0.5, row - 0.5])  # OpenCV has integers at the centres of pixels
+    affine = np.column_stack([turned, centre - turned @ centre])
+    size = (classes.shape[1], classes.shape[0])
+    # The raster is mirrored and turned by views; OpenCV wants it in one piece.
+    source = np.ascontiguousarray(classes)
+    return np.asarray(cv2.warpAffine(source, affine, size, flags=cv2.INTER_NEAREST, borderValue=0), dtype=np.uint8)
+
+
+def _jitter_colours(picture: NDArray[np.uint8], rng: np.random.Generator, strength: float) -> NDArray[np.uint8]:
+    """Scale brightness, contrast (about the mean grey) and saturation (about each pixel's grey)."""
+    brightness, contrast, saturation = 1.0 + rng.uniform(-strength, strength, size=3)
+    values = picture.astype(np.float32) * np.float32(brightness)
+    grey = values @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
+    values = grey.mean() + (values - grey.mean()) * np.float32(contrast)
+    grey = values @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
+    values = grey[..., None] + (values - grey[..., None]) * np.float32(saturation)
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _kept_classes(rng: np.random.Generator, probability: float) -> NDArray[np.uint8]:
+    """Class -> itself or void: whole groups are blanked, so that no class is relied upon alone; draws are as many."""
     lookup = np.arange(len(CLASSES), dtype=np.uint8)
     for group, drawn in zip(_DROPPED_TOGETHER, rng.random(len(_DROPPED_TOGETHER)), strict=True):
         rarer = 0.4 if group == ("building",) else 1.0
         if drawn < probability * rarer:
             lookup[[CLASS_INDEX[name] for name in group]] = CLASS_INDEX["void"]
-    return lookup[crop]
+    return lookup
 
 
 def _impoverish_scan(

@@ -17,13 +17,12 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
 from fusion.errors import SkyfixError
-from learned.losses import HeadingQuadrature, truth_nll
-from learned.rotmatch import STRIDE, RotMatchNet, RotMatchSettings, picture_tensor
+from learned.network import Batch
+from learned.rotmatch import RotMatchNet, RotMatchSettings
 from learned.samples import Augmentation, Example, Sample, augment
 
 
@@ -70,7 +69,6 @@ class TrainingSettings:
     workers: int = 1
     network: RotMatchSettings = field(default_factory=RotMatchSettings)
     augmentation: Augmentation = field(default_factory=Augmentation)
-    quadrature: HeadingQuadrature = field(default_factory=HeadingQuadrature)
 
 
 class Progress(Protocol):
@@ -105,22 +103,6 @@ class _Batches(TorchDataset[list[Example]]):
         return examples
 
 
-def batch_nll(
-    net: RotMatchNet, examples: list[Example], quadrature: HeadingQuadrature, generator: torch.Generator
-) -> Tensor:
-    """Mean negative log density (per m^2 rad) of a batch's true poses; the encoders train in bfloat16."""
-    density = torch.from_numpy(np.stack([example.density for example in examples]))
-    pictures = torch.stack([picture_tensor(example.picture) for example in examples])
-    with torch.autocast("cpu", torch.bfloat16, enabled=net.training):
-        scans, maps = net.scan_features(density), net.map_features(pictures)
-    cell = net.settings.bev.metres_per_pixel * STRIDE
-    losses = [
-        truth_nll(m, s, (e.row / STRIDE, e.col / STRIDE, e.yaw), cell, quadrature, generator)
-        for m, s, e in zip(maps.float(), scans.float(), examples, strict=True)
-    ]
-    return torch.stack(losses).mean()
-
-
 def validation_nll(net: RotMatchNet, source: SampleSource, settings: TrainingSettings) -> float:
     """Mean NLL over all samples of a source, without impoverishment, at offsets that are always the same."""
     plain = Augmentation(settings.augmentation.max_offset_px, settings.augmentation.crop_px, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -130,7 +112,7 @@ def validation_nll(net: RotMatchNet, source: SampleSource, settings: TrainingSet
     with torch.inference_mode():
         for index in range(len(source)):
             example = augment(source[index], np.random.default_rng((settings.seed, 3, index)), plain)
-            losses.append(float(batch_nll(net, [example], settings.quadrature, generator)))
+            losses.append(float(net.truth_nll(Batch.of([example]), generator)))
     net.train()
     return float(np.mean(losses))
 
@@ -163,7 +145,8 @@ def train(
     net.train()
     for step, examples in enumerate(_batches(source, settings, first), start=first):
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + step)
-        loss = batch_nll(net, examples, settings.quadrature, generator)
+        with torch.autocast("cpu", torch.bfloat16):
+            loss = net.losses(Batch.of(examples), generator)["total"]
         if not torch.isfinite(loss):
             raise SkyfixError(f"training: expected a finite loss, got {float(loss)} at step {step}")
         optimizer.zero_grad(set_to_none=True)

@@ -8,7 +8,7 @@ features may depend on both inputs, but not on the heading, which is unknown unt
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Protocol
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -158,7 +158,10 @@ def check_images(density: Tensor, picture: Tensor, bev: BevSettings) -> None:
             raise SkyfixError(f"{name}: expected finite values, got NaN or an infinity")
 
 
-class VotingMatcher:
+Net = TypeVar("Net", bound=PoseScorer)
+
+
+class VotingMatcher(Generic[Net]):
     """A voting network as a measurement model; implements `learned.matcher.MapMatcher`.
 
     Parameters
@@ -173,9 +176,7 @@ class VotingMatcher:
         Heading bins over the full circle (360: 1 degree each).
     """
 
-    def __init__(
-        self, name: str, net: PoseScorer, calibration: Calibration | None = None, yaw_bins: int = 360
-    ) -> None:
+    def __init__(self, name: str, net: Net, calibration: Calibration | None = None, yaw_bins: int = 360) -> None:
         net.eval()
         self._name, self.net = name, net
         self.calibration = calibration or Calibration()
@@ -210,4 +211,6 @@ class VotingMatcher:
         with torch.inference_mode():
             check_images(density[None], picture[None], bev)
             scores = self.net.pose_scores(density, picture, bin_yaws(bins, self.yaw_bins))
-        return volume_from_scores(scores / self.calibration.temperature, bins, self.yaw_bins, crop.grid, self.net.stride)
+        return volume_from_scores(
+            scores / self.calibration.temperature, bins, self.yaw_bins, crop.grid, self.net.stride
+        )

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusion.errors import SkyfixError
-from learned.losses import HeadingQuadrature, truth_nll
+from learned.losses import HeadingQuadrature, scores_nll
 from learned.map_raster import CLASS_INDEX
 from learned.rotmatch import RotMatchSettings
 from learned.samples import Augmentation, Sample, augment
@@ -80,10 +80,10 @@ def test_quadrature_covers_the_circle_once() -> None:
         assert float(ends[-1]) < 2 * math.pi
 
 
-def test_nll_of_blind_features_is_that_of_a_uniform_density() -> None:
-    nll = truth_nll(
-        torch.zeros(2, 32, 32), torch.zeros(2, 16, 16), (15.2, 16.9, 0.3), 1.0, HeadingQuadrature(), torch.Generator()
-    )
+def test_nll_of_equal_scores_is_that_of_a_uniform_density() -> None:
+    quadrature = HeadingQuadrature()
+    yaws, widths = quadrature.draw(0.3, torch.Generator())
+    nll = scores_nll(torch.zeros(len(yaws), 17, 17), (7.2, 8.9, 0.3), yaws, widths, 1.0, quadrature)
     assert float(nll) == pytest.approx(math.log(17 * 17 * 2 * math.pi), rel=1e-5)
 
 
