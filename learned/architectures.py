@@ -12,10 +12,10 @@ from typing import Any
 from pydantic import ConfigDict, ValidationError, create_model
 
 from fusion.errors import SkyfixError
-from learned import orienternet, rotmatch
+from learned import aglnet, orienternet, rotmatch
 from learned.network import Architecture
 
-_KNOWN = (rotmatch.ARCHITECTURE, orienternet.ARCHITECTURE)
+_KNOWN = (rotmatch.ARCHITECTURE, orienternet.ARCHITECTURE, aglnet.ARCHITECTURE)
 ARCHITECTURES: dict[str, Architecture] = {architecture.name: architecture for architecture in _KNOWN}
 """By name."""
 
