@@ -72,9 +72,9 @@ class OrienterNet(VotingNet):
         self.scan_encoder = Pyramid(len(BANDS_M), settings.scan_widths, level)
         self.map_head = nn.Conv2d(settings.map_widths[level], settings.channels + 1, 1)
         self.scan_head = nn.Conv2d(settings.scan_widths[level], settings.channels + 1, 1)
-        # Averages over thousands of cells hardly differ between poses; the scale starts where sums would have it,
+        # Averages over thousands of cells hardly differ between poses; the scale starts near where sums would have it,
         # for features that are independent from cell to cell, and is learned.
-        self.log_scale = nn.Parameter(torch.tensor(math.log(settings.bev.size / settings.stride)))
+        self.log_scale = nn.Parameter(torch.tensor(math.log(settings.bev.size / settings.stride / 4)))
 
     def neural_map(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         """Features (B, C, H / stride, W / stride) and unary log-prior (B, H / stride, W / stride) of pictures."""
