@@ -12,11 +12,20 @@ from typing import Any
 from pydantic import ConfigDict, ValidationError, create_model
 
 from fusion.errors import SkyfixError
-from learned import aglnet, orienternet, rotmatch
+from learned import aglnet, hybrid, orienternet, rotmatch, translocnet_matcher
 from learned.network import Architecture
 
-_KNOWN = (rotmatch.ARCHITECTURE, orienternet.ARCHITECTURE, aglnet.ARCHITECTURE)
-ARCHITECTURES: dict[str, Architecture] = {architecture.name: architecture for architecture in _KNOWN}
+ARCHITECTURES: dict[str, Architecture] = {
+    architecture.name: architecture
+    for architecture in (
+        rotmatch.ARCHITECTURE,
+        orienternet.ARCHITECTURE,
+        aglnet.ARCHITECTURE,
+        hybrid.ARCHITECTURE,
+        translocnet_matcher.ARCHITECTURE,
+        translocnet_matcher.COMPACT_ARCHITECTURE,
+    )
+}
 """By name."""
 
 

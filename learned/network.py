@@ -44,6 +44,8 @@ class Batch:
     first
         Number of the first example within the step's whole batch; above zero only where several processes share it.
         A network that draws once an example skips that many draws, so that the processes see what one would have.
+    place
+        (B, 2) float64: where the samples were taken, metres in one frame, NaN where that is not known; or None.
     """
 
     density: Tensor
@@ -54,6 +56,7 @@ class Batch:
     prior_yaw: Tensor
     metres_per_pixel: float = SAMPLE_METRES_PER_PIXEL
     first: int = 0
+    place: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.density)
@@ -67,15 +70,14 @@ class Batch:
         )
         density = torch.from_numpy(np.stack([example.density for example in examples]))
         picture = torch.stack([picture_tensor(example.picture) for example in examples])
-        return cls(density, picture, row, col, yaw, prior_yaw, first=first)
+        place = torch.tensor([example.place for example in examples], dtype=torch.float64)
+        return cls(density, picture, row, col, yaw, prior_yaw, first=first, place=place)
 
     def to(self, device: torch.device) -> Self:
         """The same on another device."""
-        moved = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name not in _NUMBERS}
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        moved: dict[str, Any] = {name: v.to(device) for name, v in values.items() if isinstance(v, Tensor)}
         return replace(self, **moved)
-
-
-_NUMBERS = ("metres_per_pixel", "first")
 
 
 class NetworkSettings(Protocol):

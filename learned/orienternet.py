@@ -70,7 +70,9 @@ class OrienterNet(VotingNet):
         level = STRIDES.index(settings.stride)
         self.map_encoder = Pyramid(3, settings.map_widths, level)
         self.scan_encoder = Pyramid(len(BANDS_M), settings.scan_widths, level)
-        self.map_head = nn.Conv2d(settings.map_widths[level], settings.channels + 1, 1)
+        self.map_head = nn.Conv2d(settings.map_widths[level], settings.channels, 1)
+        # A prior that is the same everywhere says nothing, so it has no bias.
+        self.prior_head = nn.Conv2d(settings.map_widths[level], 1, 1, bias=False)
         self.scan_head = nn.Conv2d(settings.scan_widths[level], settings.channels + 1, 1)
         # Averages over thousands of cells hardly differ between poses; the scale starts near where sums would have it,
         # for features that are independent from cell to cell, and is learned.
@@ -78,8 +80,8 @@ class OrienterNet(VotingNet):
 
     def neural_map(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         """Features (B, C, H / stride, W / stride) and unary log-prior (B, H / stride, W / stride) of pictures."""
-        raw = self.map_head(self.map_encoder.levels(picture)[0])
-        return raw[:, :-1], raw[:, -1]
+        decoded = self.map_encoder.levels(picture)[0]
+        return self.map_head(decoded), self.prior_head(decoded)[:, 0]
 
     def neural_bev(self, density: Tensor) -> tuple[Tensor, Tensor]:
         """Features (B, C, n / stride, n / stride) and confidence in [0, 1] (B, 1, ...) of scans."""

@@ -16,6 +16,8 @@ from learned.map_raster import CLASS_INDEX, CLASSES, PALETTE
 SAMPLE_METRES_PER_PIXEL = 0.5
 """Resolution of a sample's class raster and of its bird's-eye view."""
 
+UNKNOWN_PLACE = (math.nan, math.nan)
+
 _DROPPED_TOGETHER = (
     ("wall", "fence", "hedge"),
     ("tree",),
@@ -40,6 +42,8 @@ class Sample:
         Where the vehicle truly is, continuous pixel coordinates of `classes`.
     yaw
         True heading, radians.
+    place
+        Where it was taken, metres in a frame that all samples share; NaN where that is not known.
     """
 
     counts: NDArray[np.uint8]
@@ -47,6 +51,7 @@ class Sample:
     row: float
     col: float
     yaw: float
+    place: tuple[float, float] = UNKNOWN_PLACE
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +101,8 @@ class Example:
         The truth in the crop: continuous pixel coordinates, radians.
     prior_yaw
         The heading that is known beforehand, radians.
+    place
+        The sample's.
     """
 
     density: NDArray[np.float32]
@@ -104,6 +111,7 @@ class Example:
     col: float
     yaw: float
     prior_yaw: float
+    place: tuple[float, float] = UNKNOWN_PLACE
 
 
 def augment(sample: Sample, rng: np.random.Generator, settings: Augmentation) -> Example:
@@ -129,7 +137,8 @@ def augment(sample: Sample, rng: np.random.Generator, settings: Augmentation) ->
     picture = PALETTE[kept[classes[top : top + settings.crop_px, left : left + settings.crop_px]]]
     if settings.colour_jitter > 0:
         picture = _jitter_colours(picture, rng, settings.colour_jitter)
-    return Example(density, picture, row - top, col - left, float(se2.wrap(yaw)), float(se2.wrap(prior_yaw)))
+    truth = row - top, col - left, float(se2.wrap(yaw))
+    return Example(density, picture, *truth, float(se2.wrap(prior_yaw)), sample.place)
 
 
 def _turn_about(classes: NDArray[np.uint8], row: float, col: float, angle: float) -> NDArray[np.uint8]:

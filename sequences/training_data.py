@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from learned.bev import BevSettings, bev_counts
-from learned.samples import SAMPLE_METRES_PER_PIXEL, Sample, cut_sample
+from learned.samples import SAMPLE_METRES_PER_PIXEL, UNKNOWN_PLACE, Sample, cut_sample
 from sequences.lidar import LidarModel, simulate_scan
 from sequences.osm import MapFeatures
 from sequences.world import World, build_area, sample_road_poses
@@ -26,6 +26,8 @@ from sequences.world_style import WorldStyle
 
 _ATTEMPTS = 60
 _AREAS_MIXED = 16
+_EXTRACTS_APART_M = 1e7
+"""Every extract has a frame of its own; this puts places of different ones far apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +119,12 @@ class SimulatedSamples:
         path = self.cache_dir / f"area_{number:05d}.npz"
         if path.exists():
             with np.load(path) as data:
+                poses = data["poses"].tolist()
+                places = data["places"].tolist() if "places" in data else [UNKNOWN_PLACE] * len(poses)
+                columns = zip(data["counts"], data["classes"], poses, places, strict=True)
                 return [
-                    Sample(counts, classes, *map(float, pose))
-                    for counts, classes, pose in zip(data["counts"], data["classes"], data["poses"], strict=True)
+                    Sample(counts, classes, row, col, yaw, (x, y))
+                    for counts, classes, (row, col, yaw), (x, y) in columns
                 ]
         samples = self._simulate(number)
         partial = path.with_suffix(f".{os.getpid()}.part.npz")
@@ -128,6 +133,7 @@ class SimulatedSamples:
             counts=np.stack([s.counts for s in samples]),
             classes=np.stack([s.classes for s in samples]),
             poses=np.array([(s.row, s.col, s.yaw) for s in samples]),
+            places=np.array([s.place for s in samples]),
         )
         partial.replace(path)
         return samples
@@ -136,7 +142,8 @@ class SimulatedSamples:
         settings = self.settings
         for attempt in range(_ATTEMPTS):
             rng = np.random.default_rng((settings.seed, number, attempt))
-            features = self.extracts[int(rng.choice(len(self.extracts), p=self.weights))]
+            extract = int(rng.choice(len(self.extracts), p=self.weights))
+            features = self.extracts[extract]
             grid = _neighbourhood(features, settings.area_half_extent_m, rng)
             here = features.within(grid)
             if sum(area.kind == "building" for area in here.areas) < settings.least_buildings and rng.random() < 0.9:
@@ -149,7 +156,9 @@ class SimulatedSamples:
             azimuths = int(rng.integers(settings.azimuths[0], settings.azimuths[1] + 1))
             model = LidarModel.random(rng, azimuths)
             model = replace(model, max_range_m=min(1.5 * settings.bev_half_extent_m, model.max_range_m))
-            return [self._sample(pose, model, world, map_raster.classes, grid, rng) for pose in poses]
+            samples = [self._sample(pose, model, world, map_raster.classes, grid, rng) for pose in poses]
+            places = [(float(pose[0]) + extract * _EXTRACTS_APART_M, float(pose[1])) for pose in poses]
+            return [replace(sample, place=place) for sample, place in zip(samples, places, strict=True)]
         raise SkyfixError(f"training data: found no neighbourhood with roads and buildings in {_ATTEMPTS} attempts")
 
     def _sample(
