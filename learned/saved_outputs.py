@@ -33,6 +33,8 @@ from fusion.location_orientation import LocationOrientationMaps
 
 _YAW_OF = {"east": 0.0, "north": 0.5 * math.pi, "west": math.pi, "south": -0.5 * math.pi}
 _LEAST_PROBABILITY = 1e-30
+_EXCLUDED = -100.0
+"""ln of how much less likely than the best place an excluded one is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,16 +145,16 @@ def maps_from_field(
     """
     if not (math.isfinite(heading_std_deg) and heading_std_deg > 0):
         raise SkyfixError(f"heading spread: expected a positive number of degrees, got {heading_std_deg}")
-    plan = convention.axes.replace("K", "")
-    places = np.asarray(location)
-    places = places.reshape(places.shape[max(places.ndim - 2, 0) :]) if places.size else places
-    if places.ndim != 2:
-        raise SkyfixError(f"saved location: expected ({plan[0]}, {plan[1]}), got {np.shape(location)}")
     field = _north_up(heading, grid, convention)
     if field.shape[2] != 2 or not np.isfinite(field).all():
         raise SkyfixError(f"saved heading: expected finite (cos, sin), K = 2, got {np.shape(heading)}")
-    stacked = np.expand_dims(places, convention.axes.index("K"))
-    log_location = np.maximum(_log_values(_north_up(stacked, grid, convention), convention.values)[..., 0], -1e4)
+    if np.ndim(location) < 2:
+        raise SkyfixError(f"saved location: expected ({grid.rows}, {grid.cols}), got {np.shape(location)}")
+    places = _north_up(np.expand_dims(location, convention.axes.index("K") - 3), grid, convention)[..., 0]
+    log_location = _log_values(places, convention.values)
+    if np.isneginf(log_location).all():
+        raise SkyfixError("saved location: expected a cell with a probability above zero, got none")
+    log_location = np.maximum(log_location, log_location.max() + _EXCLUDED)
     log_location -= logsumexp(log_location) + 2 * np.log(grid.metres_per_pixel)
     length = np.hypot(field[..., 0], field[..., 1])
     angle = np.arctan2(field[..., 1], field[..., 0])
@@ -185,12 +187,12 @@ def load_field(
 def _load(path: Path, key: str | None) -> NDArray[Any]:
     """One array of a file, read without unpickling."""
     try:
-        content = np.load(path, allow_pickle=False)
-        if isinstance(content, np.ndarray):
-            if key is not None:
-                raise SkyfixError(f"{path.name}: expected an .npz with an array {key!r}, got a single array")
-            return content
-        with content:
+        with path.open("rb") as file:
+            content = np.load(file, allow_pickle=False)
+            if isinstance(content, np.ndarray):
+                if key is not None:
+                    raise SkyfixError(f"{path.name}: expected an .npz with an array {key!r}, got a single array")
+                return content
             names = content.files
             chosen = names[0] if key is None and len(names) == 1 else key
             if chosen not in names:
