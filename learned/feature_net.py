@@ -10,7 +10,11 @@ from itertools import pairwise
 
 from torch import Tensor, nn
 
+from fusion.errors import SkyfixError
+
 STEM_STRIDE = 2
+GROUPS = 4
+"""Groups of channels that are normalised together."""
 
 
 class ConvBlock(nn.Sequential):
@@ -19,7 +23,7 @@ class ConvBlock(nn.Sequential):
     def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
         super().__init__(
             nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=(kernel - stride + 1) // 2, bias=False),
-            nn.GroupNorm(4, outputs),
+            nn.GroupNorm(GROUPS, outputs),
             nn.ReLU(inplace=True),
         )
 
@@ -39,6 +43,8 @@ class Pyramid(nn.Module):
 
     def __init__(self, inputs: int, widths: tuple[int, ...], finest: int = 0) -> None:
         super().__init__()
+        if any(width < GROUPS or width % GROUPS for width in widths):
+            raise SkyfixError(f"network widths: expected multiples of {GROUPS}, got {widths}")
         stem = ConvBlock(inputs, widths[0], kernel=6, stride=STEM_STRIDE)
         self.stem = nn.Sequential(stem, ConvBlock(widths[0], widths[0]))
         pairs = list(pairwise(widths))

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from fusion.errors import SkyfixError
 from learned.bev import BANDS_M, BevSettings
 from learned.calibration import Calibration
 from learned.contrastive import Projection, info_nce
@@ -76,6 +77,14 @@ class HybridSettings:
     regression_weight: float = 0.1
     bev: BevSettings = field(default_factory=BevSettings)
     quadrature: HeadingQuadrature = field(default_factory=HeadingQuadrature)
+
+    def __post_init__(self) -> None:
+        heads, width = self.attention_heads, self.widths[-1]
+        if self.cross_attention and (heads < 1 or width % heads):
+            raise SkyfixError(f"hybrid attention_heads: expected a divisor of {width}, got {heads}")
+        for name, weight in (("contrastive", self.contrastive_weight), ("regression", self.regression_weight)):
+            if not (math.isfinite(weight) and weight >= 0):
+                raise SkyfixError(f"hybrid {name}_weight: expected zero or more, got {weight}")
 
 
 class _Head(nn.Module):

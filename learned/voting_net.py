@@ -207,7 +207,7 @@ class VotingMatcher(Generic[Net]):
         window = matching_window(map_raster, search, reach, bev.metres_per_pixel, multiple_of=CROP_MULTIPLE)
         crop = map_raster.resampled(window)
         bins = yaw_bins_within(float(search.centre[2]), search.half_heading_rad, self.yaw_bins)
-        density, picture = torch.from_numpy(log_density(counts)), picture_tensor(crop.picture)
+        density, picture = torch.from_numpy(log_density(counts)).float(), picture_tensor(crop.picture)
         with torch.inference_mode():
             check_images(density[None], picture[None], bev)
             scores = self.net.pose_scores(density, picture, bin_yaws(bins, self.yaw_bins))

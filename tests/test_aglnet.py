@@ -49,27 +49,26 @@ def scenes() -> list[Scene]:
 
 
 @pytest.fixture(scope="module")
-def fitted(scenes: list[Scene]) -> tuple[AglNet, list[float]]:
+def fitted(scenes: list[Scene]) -> AglNet:
+    """A network that learned the scenes on maps of any scale."""
     net = net_of(replace(TINY, scale_weight=1.0))
-    return net, fit(net, batch_of(scenes), 36)
-
-
-def test_learns_scenes_and_finds_their_poses_in_all_quadrants(
-    fitted: tuple[AglNet, list[float]], scenes: list[Scene]
-) -> None:
-    net, totals = fitted
+    totals = fit(net, batch_of(scenes), 36)
     assert totals[-1] < totals[0] - 5.0
+    return net
+
+
+def test_learns_scenes_and_finds_their_poses_in_all_quadrants(scenes: list[Scene]) -> None:
+    net = net_of(replace(TINY, coarse_level=1, scales=(1.0,)))
+    fit(net, batch_of(scenes), 24)
     with torch.inference_mode():
         nll = net.truth_nll(batch_of(scenes), torch.Generator().manual_seed(0))
-    assert float(nll.max()) < BLIND_NLL - 3.0
+    assert float(nll.max()) < BLIND_NLL - 4.0
     for one in scenes:
         assert_finds(AglNetMatcher(net, yaw_bins=72), one, metres=1.0, degrees=5.0)
 
 
-def test_the_scale_of_a_map_is_told_and_the_pose_found_on_it(
-    fitted: tuple[AglNet, list[float]], scenes: list[Scene]
-) -> None:
-    net, _ = fitted
+def test_the_scale_of_a_map_is_told_and_the_pose_found_on_it(fitted: AglNet, scenes: list[Scene]) -> None:
+    net = fitted
     batch = batch_of(scenes)
     told = []
     for scale in net.settings.scales:
@@ -87,9 +86,9 @@ def test_the_scale_of_a_map_is_told_and_the_pose_found_on_it(
     assert sum(told) >= 9
 
 
-def test_the_fine_stage_is_finer(fitted: tuple[AglNet, list[float]], scenes: list[Scene]) -> None:
+def test_the_fine_stage_is_finer(fitted: AglNet, scenes: list[Scene]) -> None:
     """With the second stage the likelihood of the truth is higher than with the first alone."""
-    net, _ = fitted
+    net = fitted
     coarse = AglNet(replace(net.settings, refinement=replace(net.settings.refinement, modes=0)))
     coarse.load_state_dict(net.state_dict())
     batch = batch_of(scenes)
@@ -155,7 +154,7 @@ def test_checkpoints_round_trip(tmp_path: Path) -> None:
 
 
 @given(seed=st.integers(0, 10_000), modes=st.integers(0, 4), narrow=st.booleans())
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_refinement_keeps_every_windows_mass(seed: int, modes: int, narrow: bool) -> None:
     generator = torch.Generator().manual_seed(seed)
     coarse, fine = (4 * torch.randn(6, 9, 11, generator=generator, dtype=torch.float64) for _ in range(2))
@@ -190,6 +189,7 @@ def test_refinement_keeps_every_windows_mass(seed: int, modes: int, narrow: bool
 
 
 @given(yaw=st.floats(-3.1, 3.1), half_deg=st.floats(12.0, 90.0), seed=st.integers(0, 99))
+@settings(max_examples=30)
 def test_headings_of_a_window_cover_it_once(yaw: float, half_deg: float, seed: int) -> None:
     quadrature, half = HeadingQuadrature(5, 4.0, 6), math.radians(half_deg)
     yaws, widths = headings_within(quadrature, yaw, half, torch.Generator().manual_seed(seed))
@@ -224,7 +224,7 @@ def test_a_map_seen_from_a_pose_shows_what_is_ahead_ahead(yaw: float, scale: flo
 
 
 @given(scale=st.floats(0.7, 1.4))
-@settings(max_examples=20)
+@settings(max_examples=10)
 def test_scaling_a_scan_and_a_map_move_things_alike(scale: float) -> None:
     """What is d from the vehicle in the scan is s d from it on the map, and the vehicle stays where it is."""
     scales = torch.tensor([scale])
