@@ -13,6 +13,7 @@ that what was read is spread over the finer levels.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
