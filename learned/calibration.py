@@ -51,6 +51,12 @@ class CountsMatcher(Protocol):
         ...
 
 
+def sample_map(sample: Sample) -> MapRaster:
+    """The map of a sample, in a frame whose origin is the lower left corner of its class raster."""
+    rows, cols = sample.classes.shape
+    return MapRaster.from_classes(MapGrid(rows, cols, SAMPLE_METRES_PER_PIXEL, 0.0, 0.0), sample.classes)
+
+
 def match_samples(
     matcher: CountsMatcher, samples: Sequence[Sample], half_extent_m: float, half_heading_rad: float, seed: int
 ) -> tuple[list[LikelihoodVolume], NDArray[np.float64]]:
@@ -65,10 +71,9 @@ def match_samples(
     half = np.array([half_extent_m, half_extent_m, half_heading_rad])
     volumes, truths = [], []
     for sample in samples:
-        grid = MapGrid(sample.classes.shape[0], sample.classes.shape[1], SAMPLE_METRES_PER_PIXEL, 0.0, 0.0)
-        truth = np.array([*grid.xy_from_pixel((sample.row, sample.col)), sample.yaw])
+        raster = sample_map(sample)
+        truth = np.array([*raster.grid.xy_from_pixel((sample.row, sample.col)), sample.yaw])
         search = SearchRegion(truth + rng.uniform(-half, half), half_extent_m, half_heading_rad)
-        raster = MapRaster.from_classes(grid, sample.classes)
         volumes.append(matcher.match_counts(sample.counts.astype(np.float32), raster, search))
         truths.append(truth)
     return volumes, np.array(truths)

@@ -6,6 +6,7 @@ settings and turned into a matcher. `learned.architectures.ARCHITECTURES` lists 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Protocol, Self
@@ -196,3 +197,12 @@ class Architecture:
 def picture_tensor(picture: NDArray[np.uint8]) -> Tensor:
     """(rows, cols, 3) uint8 -> (3, rows, cols) float32 in [0, 1]."""
     return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float() / 255.0
+
+
+def on_cpu(net: LocalizationNet) -> LocalizationNet:
+    """The network itself if it is on the CPU, else a copy that is."""
+    if all(parameter.device.type == "cpu" for parameter in net.parameters()):
+        return net
+    copied = copy.deepcopy(net)
+    copied.to(torch.device("cpu"))
+    return copied

@@ -15,7 +15,7 @@ from learned.losses import HeadingQuadrature, truth_nll
 from learned.map_raster import CLASS_INDEX
 from learned.rotmatch import RotMatchSettings
 from learned.samples import Augmentation, Sample, augment
-from learned.training import TrainingSettings, train
+from learned.training import NetworkChoice, TrainingSettings, train
 
 WALL = CLASS_INDEX["wall"]
 PLAIN = Augmentation(drop_class=0.0, thin=0.0, shorten=0.0, drop_sector=0.0, drop_band=0.0)
@@ -88,7 +88,12 @@ def test_nll_of_blind_features_is_that_of_a_uniform_density() -> None:
 
 
 TINY = TrainingSettings(
-    steps=6, batch=2, workers=0, validate_every=3, warmup_steps=2, network=RotMatchSettings(4, (4, 4, 8, 8))
+    steps=6,
+    batch=2,
+    workers=0,
+    validate_every=3,
+    warmup_steps=2,
+    network=NetworkChoice(settings=RotMatchSettings(4, (4, 4, 8, 8))),
 )
 
 
