@@ -179,6 +179,8 @@ class Architecture:
         weights fit one reach alone.
     version
         Raised when weights of before no longer fit.
+    factored
+        Whether the heading is predicted apart from the position, so that its calibration gets a parameter of its own.
     """
 
     name: str
@@ -187,6 +189,7 @@ class Architecture:
     matcher: Callable[[Any, Calibration], NetworkMatcher]
     reaching: Callable[[Any, float], LocalizationNet] | None = None
     version: int = 1
+    factored: bool = False
 
     @property
     def tag(self) -> str:

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from fusion.likelihood import LikelihoodVolume
 from learned.bev import BANDS_M, BevSettings, bev_counts, log_density
-from learned.calibration import Calibration
+from learned.calibration import Calibration, with_heading_concentration
 from learned.checkpoint import load_network, save_network
 from learned.losses import HeadingQuadrature, truth_nll
 from learned.map_raster import MapRaster
@@ -178,7 +178,8 @@ class RotMatch:
             scan = self.net.scan_features(density[None])[0]
             features = self.net.map_features(picture[None])[0]
             scores = vote(features, scan, bin_yaws(bins, self.yaw_bins)) / self.calibration.temperature
-        return volume_from_scores(scores, bins, self.yaw_bins, crop.grid, STRIDE)
+        volume = volume_from_scores(scores, bins, self.yaw_bins, crop.grid, STRIDE)
+        return with_heading_concentration(volume, self.calibration.heading_concentration)
 
     @classmethod
     def shipped(cls) -> Self:

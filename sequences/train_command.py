@@ -20,13 +20,15 @@ import numpy as np
 from fusion import se2
 from fusion.errors import SkyfixError
 from learned.bev import log_density
-from learned.calibration import Calibration, fit_temperature, match_samples, mean_nll, sample_map
+from learned.calibration import RIGHT_WITHIN_M, Calibration, fit_calibration, match_samples, mean_nll, sample_map
 from learned.checkpoint import save_network
 from learned.network import Architecture, LocalizationNet, on_cpu
 from learned.processes import Processes, joined_processes
+from learned.reliability import highest_density_level, region_coverage, reliability
 from learned.samples import Sample
 from learned.training import STATE_FILE, Progress, ValidationView, make_folder, train
 from sequences.figures.loss_curve import draw_loss_curve
+from sequences.figures.reliability import reliability_figure
 from sequences.figures.style import png_bytes
 from sequences.figures.validation import validation_figure
 from sequences.osm import MapFeatures, read_osm
@@ -87,7 +89,8 @@ def train_from_config(
     data_dir
         Folder that the extracts' paths are relative to.
     out_dir
-        Gets config.yaml (resolved), state.pt, loss.csv, loss.png, validation/*.png, the checkpoint and, without
+        Gets config.yaml (resolved), state.pt, loss.csv, loss.png, validation/*.png, calibration.png, the checkpoint
+        and, without
         another, the cache.
     progress
         Told of every step.
@@ -125,23 +128,38 @@ def train_from_config(
     return path
 
 
-def calibrated(architecture: Architecture, net: Any, samples: list[Sample]) -> tuple[Calibration, dict[str, float]]:
-    """Fit the calibration on held-out samples, heading unknown within +-20 m, and score single shots on them."""
+def calibrated(
+    architecture: Architecture, net: Any, samples: list[Sample], figure: Path
+) -> tuple[Calibration, dict[str, float]]:
+    """Fit the calibration on held-out samples, heading unknown within +-20 m, and score single shots on them.
+
+    How far the calibrated likelihoods may be believed is drawn into `figure`; it is of the samples that they were
+    fitted on.
+    """
     matcher = architecture.matcher(net, Calibration())
     volumes, truths = match_samples(matcher, samples, _HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
-    temperature = fit_temperature(volumes, truths)
-    best = np.array([volume.modes(1).means[0] for volume in volumes])
+    calibration = fit_calibration(volumes, truths, architecture.factored)
+    ready = [calibration.applied(volume) for volume in volumes]
+    best = np.array([volume.modes(1).means[0] for volume in ready])
     position = np.hypot(*(best - truths)[:, :2].T)
     heading = np.degrees(np.abs(se2.wrap(best[:, 2] - truths[:, 2])))
+    levels = [highest_density_level(volume, truth) for volume, truth in zip(ready, truths, strict=True)]
+    chances = [calibration.confidence(volume) for volume in ready]
+    confidence = reliability(chances, position < RIGHT_WITHIN_M, bins=5)
+    covered = region_coverage(levels)
+    figure.write_bytes(png_bytes(reliability_figure(confidence, np.array(levels))))
     metrics = {
         "samples": len(samples),
-        "nll": round(mean_nll(volumes, truths, temperature), 3),
+        "nll": round(mean_nll(ready, truths, 1.0), 3),
         "position_mean_m": round(float(position.mean()), 3),
         "position_median_m": round(float(np.median(position)), 3),
-        "within_5_m": round(float((position < 5.0).mean()), 3),
+        "within_5_m": round(float((position < RIGHT_WITHIN_M).mean()), 3),
         "heading_median_deg": round(float(np.median(heading)), 3),
+        "coverage_50": round(covered[0.5], 3),
+        "coverage_90": round(covered[0.9], 3),
+        "expected_calibration_error": round(confidence.expected_calibration_error, 3),
     }
-    return Calibration(temperature=temperature), metrics
+    return calibration, metrics
 
 
 def _settled(
@@ -217,7 +235,8 @@ def _finish(net: LocalizationNet, far: SimulatedSamples, config: TrainConfig, co
     net = on_cpu(net)
     if architecture.reaching is not None:
         net = architecture.reaching(net, config.matching_reach_m)
-    calibration, metrics = calibrated(architecture, net, [far[i] for i in range(len(far))])
+    samples = [far[i] for i in range(len(far))]
+    calibration, metrics = calibrated(architecture, net, samples, path.with_name("calibration.png"))
     provenance: dict[str, object] = {
         "command": command,
         "config": config.model_dump(mode="json"),
