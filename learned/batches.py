@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import signal
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Protocol
@@ -16,6 +19,8 @@ from learned.network import Batch
 from learned.processes import ALONE, Processes
 from learned.samples import Augmentation, Example, Sample, augment
 from learned.training_settings import TrainingSettings
+
+_PR_SET_PDEATHSIG = 1
 
 
 class SampleSource(Protocol):
@@ -80,9 +85,21 @@ def training_batches(
             f"training batch: expected a multiple of the {processes.count} processes, got {settings.batch}"
         )
     steps, workers = _Steps(source, settings, first, processes), settings.workers
-    loader = DataLoader(steps, batch_size=None, num_workers=workers, prefetch_factor=8 if workers else None)
+    loader = DataLoader(
+        steps,
+        batch_size=None,
+        num_workers=workers,
+        prefetch_factor=8 if workers else None,
+        worker_init_fn=_end_with_parent,
+    )
     for examples in loader:
         yield Batch.of(examples, steps.offset)
+
+
+def _end_with_parent(worker: int) -> None:
+    """Ask Linux to end a worker when its parent is killed: it could wait forever to hand over a batch."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def validation_batch(source: SampleSource, index: int, settings: TrainingSettings) -> Batch:

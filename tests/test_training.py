@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from landmarks import Landmarks
@@ -64,20 +63,6 @@ def test_resuming_gives_the_weights_that_going_on_would_have_given(tmp_path: Pat
         torch.testing.assert_close(a, b, rtol=0, atol=0)
     with pytest.raises(SkyfixError, match="other settings"):
         train(source, held_out, replace(TINY, seed=5), tmp_path / "resumed")
-
-
-def weights_of(net: torch.nn.Module) -> list[np.ndarray]:
-    return [parameter.detach().numpy() for parameter in net.parameters()]
-
-
-def test_workers_change_nothing(tmp_path: Path) -> None:
-    alone = train(Landmarks(5), Landmarks(1), TINY, tmp_path / "alone")
-    helped = train(Landmarks(5), Landmarks(1), replace(TINY, workers=2), tmp_path / "helped")
-    for a, b in zip(weights_of(alone), weights_of(helped), strict=True):
-        np.testing.assert_array_equal(a, b)
-    again = train(Landmarks(5), Landmarks(1), replace(TINY, workers=1), tmp_path / "alone")  # finished: only loaded
-    for a, b in zip(weights_of(alone), weights_of(again), strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_training_learns_to_match(tmp_path: Path) -> None:
