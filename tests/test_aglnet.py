@@ -59,7 +59,7 @@ def fitted(scenes: list[Scene]) -> AglNet:
 
 def test_learns_scenes_and_finds_their_poses_in_all_quadrants(scenes: list[Scene]) -> None:
     net = net_of(replace(TINY, coarse_level=1, scales=(1.0,)))
-    fit(net, batch_of(scenes), 24)
+    fit(net, batch_of(scenes), 18)
     with torch.inference_mode():
         nll = net.truth_nll(batch_of(scenes), torch.Generator().manual_seed(0))
     assert float(nll.max()) < BLIND_NLL - 4.0
