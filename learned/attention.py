@@ -17,7 +17,7 @@ class ChannelSpatialAttention(nn.Module):
 
     def __init__(self, channels: int, reduction: int = 16, kernel: int = 7) -> None:
         super().__init__()
-        hidden = max(1, channels // reduction)
+        hidden = max(4, channels // reduction)  # of fewer, all may be dead
         self.channel = nn.Sequential(
             nn.Linear(channels, hidden, bias=False), nn.ReLU(inplace=True), nn.Linear(hidden, channels, bias=False)
         )
@@ -57,7 +57,8 @@ class CrossAttention(nn.Module):
         super().__init__()
         self.heads = heads
         self.query_norm, self.key_norm, self.output_norm = (nn.LayerNorm(channels) for _ in range(3))
-        self.query, self.key, self.value, self.output = (nn.Linear(channels, channels) for _ in range(4))
+        self.query, self.value, self.output = (nn.Linear(channels, channels) for _ in range(3))
+        self.key = nn.Linear(channels, channels, bias=False)  # softmax would not see one: it adds the same to every key
         self.bias = RelativePositionBias(heads, side)
         self.feed_forward = nn.Sequential(
             nn.Linear(channels, expansion * channels), nn.GELU(), nn.Linear(expansion * channels, channels)

@@ -76,17 +76,12 @@ class Decoder(nn.Module):
 
 
 class PoseHeads(nn.Module):
-    """Location and orientation, both linear in a cell's features."""
+    """Location and orientation, both linear in a cell's features: 1 x 1 convolutions, applied to lists of cells."""
 
     def __init__(self, channels: int, yaw_bins: int) -> None:
         super().__init__()
-        self.location = nn.Conv2d(channels, 1, 1)
+        self.location = nn.Linear(channels, 1, bias=False)  # the softmax over cells would not see a bias
         self.orientation = nn.Linear(channels, yaw_bins)
-
-    def orientation_at(self, features: Tensor, cells: Tensor) -> Tensor:
-        """Heading logits (B, N, K) of cells (B, N), indices into the flattened rows of features (B, C, H, W)."""
-        index = cells[:, None, :].expand(-1, features.shape[1], -1)
-        return self.orientation(features.flatten(2).gather(2, index).transpose(1, 2))
 
 
 class ConfidenceHead(nn.Module):

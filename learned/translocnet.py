@@ -59,6 +59,9 @@ class TransLocNet(nn.Module):
         if settings.loss.contrastive > 0:
             self.map_projection = Projection(channels, settings.embedding)
             self.scan_projection = Projection(channels, settings.embedding)
+        for parameter in self.parameters():
+            if parameter.ndim == 4:  # a third quicker on a CPU
+                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
 
     def forward(self, density: Tensor, picture: Tensor, prior_yaw: Tensor) -> TransLocNetOutput:
         """Compare scans with maps.
@@ -86,7 +89,7 @@ class TransLocNet(nn.Module):
         pooled = fused.mean(dim=(2, 3))
         pose: PoseMaps | DirectPose
         if self.decoder is not None and self.heads is not None:
-            pose = PoseMaps(self.decoder(fused, levels).float(), self.heads)
+            pose = PoseMaps.of(self.decoder(fused, levels).float(), self.heads)
             confidence = self.confidence(torch.cat([pooled, pose.evidence()], dim=1))
         elif self.regression is not None:
             pose = DirectPose(self.regression(pooled))
@@ -147,7 +150,8 @@ class TransLocNet(nn.Module):
 
     def _pooled(self, image: Tensor) -> Tensor:
         """Average to the network's resolution."""
-        return image if self.settings.pool == 1 else nn.functional.avg_pool2d(image, self.settings.pool)
+        pooled = image if self.settings.pool == 1 else nn.functional.avg_pool2d(image, self.settings.pool)
+        return pooled.contiguous(memory_format=torch.channels_last)
 
     def _check_scale(self, batch: Batch) -> None:
         expected = self.settings.bev.metres_per_pixel

@@ -45,7 +45,7 @@ def training_losses(
     terms: dict[str, Tensor] = {}
     if isinstance(pose, PoseMaps):
         target = location_target(cells, settings.cells, weights.location_sigma_m / settings.cell_m)
-        terms["location"] = -(target * pose.log_location().flatten(1)).sum(dim=1).mean()
+        terms["location"] = -(target * pose.log_location.flatten(1)).sum(dim=1).mean()
         share, log_p = _sparse_orientation(pose, target, weights.orientation_cells)
         bins = heading_target(heading, settings.yaw_bins, weights.heading_sigma_deg)
         terms["orientation"] = orientation_loss(log_p, share, bins)
@@ -154,7 +154,7 @@ def true_pose_nll(settings: TransLocNetSettings, pose: PoseMaps | DirectPose, ba
     below = position.floor()
     bins = torch.stack([below, below + 1], dim=1).long() % settings.yaw_bins
     bin_weights = torch.stack([1 - (position - below), position - below], dim=1)
-    location = pose.log_location().flatten(1).gather(1, corners)
+    location = pose.log_location.flatten(1).gather(1, corners)
     orientation = pose.log_orientation(corners).gather(2, bins[:, None, :].expand(-1, corners.shape[1], -1))
     joint = location[:, :, None] + orientation - math.log(settings.cell_m**2 * step)
     weight = place_weights[:, :, None] * bin_weights[:, None, :]

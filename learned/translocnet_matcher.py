@@ -124,13 +124,13 @@ class TransLocNetMatcher:
         self, output: TransLocNetOutput, pose: PoseMaps, grid: MapGrid, search: SearchRegion
     ) -> LazyPoseMaps:
         with torch.inference_mode():
-            location = pose.log_location()[0] - 2 * math.log(grid.metres_per_pixel)
+            location = pose.log_location[0] - 2 * math.log(grid.metres_per_pixel)
             confidence = float(torch.sigmoid(output.confidence[0]))
             first = int(heading_bin(_prior_yaw(search), self.net.settings.yaw_bins))
             head = pose.heads.orientation
             # Bin 0 of the head is the prior's: renumbered, bin 0 is east.
             weight, bias = (torch.roll(parameter, first, dims=0).numpy() for parameter in (head.weight, head.bias))
-            features = pose.features[0].permute(1, 2, 0).contiguous().numpy()
+            features = pose.features[0].contiguous().numpy()
         return LazyPoseMaps(location.numpy(), features, weight, bias, grid, confidence)
 
     def _gaussian_volume(

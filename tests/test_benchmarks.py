@@ -10,9 +10,22 @@ from pathlib import Path
 import filterpy.monte_carlo.resampling
 import numpy as np
 import pytest
+import torch
+from made_translocnet import TINY as TINY_NETWORK
 
-from benchmarks import BENCHMARKS, Candidate, Case, filter_step, markdown_table, smoother, thread_statement, time_case
+from benchmarks import (
+    BENCHMARKS,
+    Candidate,
+    Case,
+    filter_step,
+    markdown_table,
+    smoother,
+    thread_statement,
+    time_case,
+    translocnet,
+)
 from benchmarks.runner import WARM_UP_RUNS
+from benchmarks.training_cost import training_cost
 from fusion import ParticleFilter, se2
 from sequences.cli import main
 
@@ -21,6 +34,7 @@ TINY_VOLUME = filter_step.example_volume(cells=32, bins=36)
 TINY: dict[str, Callable[[], Iterator[Case]]] = {
     "filter_step": lambda: filter_step.cases([50, 200], TINY_VOLUME),
     "smoother": lambda: smoother.cases([5, 20]),
+    "translocnet": lambda: translocnet.cases([TINY_NETWORK]),
 }
 
 
@@ -136,6 +150,19 @@ def test_the_jacobian_is_that_of_the_residuals() -> None:
     np.testing.assert_allclose(problem.jacobian(x).toarray(), np.transpose(numerical), atol=1e-4)
 
 
+def test_the_yardstick_of_the_network_multiplies_as_often() -> None:
+    layer, x = torch.nn.Conv2d(3, 8, 3, padding=1), torch.rand(1, 3, 16, 16)
+    assert translocnet.multiplications(lambda: layer(x)) == 3 * 8 * 9 * 16 * 16
+    work = translocnet.matrix_products(3 * 512**3)
+    assert translocnet.multiplications(work) == 3 * 512**3
+
+
+def test_the_cost_of_training_is_of_this_process() -> None:
+    seconds, megabytes = training_cost(TINY_NETWORK, 1)
+    assert 0.0 < seconds < 60.0
+    assert megabytes > 100.0  # torch alone is more
+
+
 @pytest.mark.usefixtures("tiny")
 def test_command_prints_a_table_and_writes_the_rows(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -154,7 +181,7 @@ def test_command_prints_a_table_and_writes_the_rows(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nonsense"], "benchmark: expected one of filter_step, smoother, got 'nonsense'"),
+        (["nonsense"], "benchmark: expected one of filter_step, smoother, translocnet, got 'nonsense'"),
         (["smoother", "--runs", "0"], "runs: expected >= 1, got 0"),
     ],
 )
