@@ -174,7 +174,10 @@ class HybridNet(VotingNet):
         return {"total": total, **terms}
 
     def reaching(self, half_extent_m: float) -> HybridNet:
-        """The same weights for a scan image of another extent; attention reads from any number of tokens."""
+        """The same weights for a scan image of another extent.
+
+        Attention reads from any number of tokens, but was trained on the number that training's crops have.
+        """
         net = HybridNet(replace(self.settings, bev=replace(self.bev, half_extent_m=half_extent_m)))
         net.load_state_dict(self.state_dict())
         return net
