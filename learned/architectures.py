@@ -12,13 +12,16 @@ from typing import Any
 from pydantic import ConfigDict, ValidationError, create_model
 
 from fusion.errors import SkyfixError
-from learned import rotmatch, translocnet_matcher
+from learned import aglnet, hybrid, orienternet, rotmatch, translocnet_matcher
 from learned.network import Architecture
 
 ARCHITECTURES: dict[str, Architecture] = {
     architecture.name: architecture
     for architecture in (
         rotmatch.ARCHITECTURE,
+        orienternet.ARCHITECTURE,
+        aglnet.ARCHITECTURE,
+        hybrid.ARCHITECTURE,
         translocnet_matcher.ARCHITECTURE,
         translocnet_matcher.COMPACT_ARCHITECTURE,
     )

@@ -2,11 +2,13 @@
 
 A network that was trained on other maps, or weights chosen by hand, give scores on a scale of their own. One
 temperature, fitted by maximum likelihood of the true poses (Guo et al., "On Calibration of Modern Neural Networks",
-ICML 2017, section 4.2), puts them right.
+ICML 2017, section 4.2), puts them right. A network that predicts headings apart from positions may be as wrong about
+its headings in another measure: they get a concentration of their own, fitted in the same way.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,15 +16,22 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
+from scipy.special import logsumexp
 
+from fusion import se2
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
-from fusion.likelihood import LikelihoodVolume
+from fusion.likelihood import LikelihoodVolume, PoseLikelihood, log_uniform_density
+from learned.confidence import fit_confidence, peak_mass, probability
 from learned.map_raster import MapRaster
 from learned.matcher import SearchRegion
 from learned.samples import SAMPLE_METRES_PER_PIXEL, Sample
 
+RIGHT_WITHIN_M = 5.0
+"""A single shot is right when its best mode is this near to the true position."""
+
 _LOG_TEMPERATURE_BOUNDS = (np.log(0.05), np.log(50.0))
+_LOG_CONCENTRATION_BOUNDS = (np.log(0.02), np.log(20.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +44,31 @@ class Calibration:
         Divides the scores.
     error_correlation_length_m
         Distance over which the errors of neighbouring frames decorrelate (1/e).
+    heading_concentration
+        The density of the heading at each position is raised to this power; see `with_heading_concentration`.
+    confidence_slope, confidence_intercept
+        From the mass in the best mode to the chance that it is right; see `learned.confidence`.
     """
 
     temperature: float = 1.0
     error_correlation_length_m: float = 6.0
+    heading_concentration: float = 1.0
+    confidence_slope: float = 1.0
+    confidence_intercept: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("temperature", "error_correlation_length_m", "heading_concentration"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise SkyfixError(f"calibration {name}: expected above zero, got {value}")
+
+    def applied(self, volume: LikelihoodVolume) -> LikelihoodVolume:
+        """A likelihood of the matcher before calibration -> one of the calibrated matcher."""
+        return with_heading_concentration(volume.tempered(self.temperature), self.heading_concentration)
+
+    def confidence(self, likelihood: PoseLikelihood) -> float:
+        """The chance that the best mode of a calibrated likelihood is right: within `RIGHT_WITHIN_M` of the truth."""
+        return float(probability(peak_mass(likelihood), self.confidence_slope, self.confidence_intercept)[0])
 
 
 class CountsMatcher(Protocol):
@@ -49,6 +79,12 @@ class CountsMatcher(Protocol):
     ) -> LikelihoodVolume:
         """Likelihood of the poses in a search region."""
         ...
+
+
+def sample_map(sample: Sample) -> MapRaster:
+    """The map of a sample, in a frame whose origin is the lower left corner of its class raster."""
+    rows, cols = sample.classes.shape
+    return MapRaster.from_classes(MapGrid(rows, cols, SAMPLE_METRES_PER_PIXEL, 0.0, 0.0), sample.classes)
 
 
 def match_samples(
@@ -65,10 +101,9 @@ def match_samples(
     half = np.array([half_extent_m, half_extent_m, half_heading_rad])
     volumes, truths = [], []
     for sample in samples:
-        grid = MapGrid(sample.classes.shape[0], sample.classes.shape[1], SAMPLE_METRES_PER_PIXEL, 0.0, 0.0)
-        truth = np.array([*grid.xy_from_pixel((sample.row, sample.col)), sample.yaw])
+        raster = sample_map(sample)
+        truth = np.array([*raster.grid.xy_from_pixel((sample.row, sample.col)), sample.yaw])
         search = SearchRegion(truth + rng.uniform(-half, half), half_extent_m, half_heading_rad)
-        raster = MapRaster.from_classes(grid, sample.classes)
         volumes.append(matcher.match_counts(sample.counts.astype(np.float32), raster, search))
         truths.append(truth)
     return volumes, np.array(truths)
@@ -110,8 +145,7 @@ def fit_temperature(volumes: Sequence[LikelihoodVolume], truths: NDArray[np.floa
     SkyfixError
         If there are no volumes or the numbers differ.
     """
-    if len(volumes) == 0 or len(volumes) != len(truths):
-        raise SkyfixError(f"calibration: expected as many volumes as truths, got {len(volumes)} and {len(truths)}")
+    _check_pairs(volumes, truths)
     found = minimize_scalar(
         lambda log_t: mean_nll(volumes, truths, float(np.exp(log_t)), outliers),
         bounds=_LOG_TEMPERATURE_BOUNDS,
@@ -119,3 +153,85 @@ def fit_temperature(volumes: Sequence[LikelihoodVolume], truths: NDArray[np.floa
         options={"xatol": 0.01},
     )
     return float(np.exp(found.x))
+
+
+def with_heading_concentration(volume: LikelihoodVolume, concentration: float) -> LikelihoodVolume:
+    """Raise the density of the heading given the position to a power, normalised again at each position.
+
+    The density of the position alone stays as it is. Above 1 headings get sharper.
+    """
+    if concentration == 1.0:
+        return volume
+    evaluated = volume.log_prob > volume.floor
+    width = np.log(se2.TWO_PI / volume.log_prob.shape[2])
+    log_prob = np.where(evaluated, volume.log_prob.astype(np.float64), -np.inf)
+    position = logsumexp(log_prob, axis=2, keepdims=True) + width
+    with np.errstate(invalid="ignore"):  # positions that were evaluated at no heading
+        powered = concentration * (log_prob - position)
+        powered += position - logsumexp(powered, axis=2, keepdims=True) - width
+    floor = min(volume.floor, float(powered.min(where=evaluated, initial=np.inf)) - 1.0)
+    return LikelihoodVolume(np.where(evaluated, powered, floor).astype(np.float32), volume.grid, floor)
+
+
+def fit_heading_concentration(
+    volumes: Sequence[LikelihoodVolume], truths: NDArray[np.float64], outliers: float = 0.05
+) -> float:
+    """The concentration that makes the true poses (N, 3) most likely; as `fit_temperature`, `outliers` above zero."""
+    _check_pairs(volumes, truths)
+    patches = [_patch(volume, truth) for volume, truth in zip(volumes, truths, strict=True)]
+    uniform = np.log(outliers) + np.array([log_uniform_density(volume.grid) for volume in volumes])
+
+    def nll(log_concentration: float) -> float:
+        powered = [with_heading_concentration(patch, math.exp(log_concentration)) for patch in patches]
+        values = [patch.log_density(truth[None])[0] for patch, truth in zip(powered, truths, strict=True)]
+        return -float(np.mean(np.logaddexp(np.log1p(-outliers) + np.array(values), uniform)))
+
+    found = minimize_scalar(nll, bounds=_LOG_CONCENTRATION_BOUNDS, method="bounded", options={"xatol": 0.005})
+    return float(np.exp(found.x))
+
+
+def fit_calibration(
+    volumes: Sequence[LikelihoodVolume], truths: NDArray[np.float64], factored: bool = False
+) -> Calibration:
+    """Fit everything on held-out likelihoods of a matcher that is not calibrated yet.
+
+    Parameters
+    ----------
+    volumes, truths
+        As `match_samples` gives them.
+    factored
+        Whether the headings get a concentration of their own, given the temperature.
+    """
+    temperature = fit_temperature(volumes, truths)
+    tempered = [volume.tempered(temperature) for volume in volumes]
+    concentration = fit_heading_concentration(tempered, truths) if factored else 1.0
+    ready = [with_heading_concentration(volume, concentration) for volume in tempered]
+    slope, intercept = fit_confidence([peak_mass(volume) for volume in ready], are_right(ready, truths))
+    return Calibration(
+        temperature=temperature,
+        heading_concentration=concentration,
+        confidence_slope=slope,
+        confidence_intercept=intercept,
+    )
+
+
+def are_right(volumes: Sequence[LikelihoodVolume], truths: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether the best mode of each is within `RIGHT_WITHIN_M` of the true position."""
+    best = np.array([volume.modes(1).means[0, :2] for volume in volumes])
+    return np.asarray(np.hypot(*(best - truths[:, :2]).T) < RIGHT_WITHIN_M)
+
+
+def _check_pairs(volumes: Sequence[LikelihoodVolume], truths: NDArray[np.float64]) -> None:
+    if len(volumes) == 0 or len(volumes) != len(truths):
+        raise SkyfixError(f"calibration: expected as many volumes as truths, got {len(volumes)} and {len(truths)}")
+
+
+def _patch(volume: LikelihoodVolume, truth: NDArray[np.float64]) -> LikelihoodVolume:
+    """The positions that the interpolated density at a pose comes from: two by two cells, all headings."""
+    grid = volume.grid
+    if not grid.contains(truth[:2]) or min(grid.rows, grid.cols) < 2:
+        raise SkyfixError(f"calibration: expected the true position inside the crop, got {truth[:2]}")
+    row, col = np.clip(np.floor(grid.pixel_from_xy(truth[:2]) - 0.5), 0, (grid.rows - 2, grid.cols - 2)).astype(int)
+    cell = grid.metres_per_pixel
+    around = MapGrid(2, 2, cell, grid.x0 + col * cell, grid.y0 + (grid.rows - row - 2) * cell)
+    return LikelihoodVolume(volume.log_prob[row : row + 2, col : col + 2], around, volume.floor)

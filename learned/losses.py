@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from learned.voting import vote
-
 
 @dataclass(frozen=True, slots=True)
 class HeadingQuadrature:
@@ -36,36 +34,33 @@ class HeadingQuadrature:
         return torch.cat([fine, coarse]), widths
 
 
-def truth_nll(
-    map_features: Tensor,
-    scan_features: Tensor,
+def scores_nll(
+    scores: Tensor,
     truth: tuple[float, float, float],
+    yaws: Tensor,
+    widths: Tensor,
     metres_per_cell: float,
     quadrature: HeadingQuadrature,
-    generator: torch.Generator,
 ) -> Tensor:
-    """Negative log density (per m^2 rad) of the true pose under the voted volume.
+    """Negative log density (per m^2 rad) of the true pose under the softmax of scores.
 
     Parameters
     ----------
-    map_features, scan_features
-        (C, H, W) and (C, n, n), on the same cell size.
+    scores
+        (R, rows, cols) unnormalised log densities at the headings `yaws`.
     truth
-        Row and column (continuous, in feature cells of the map, integers at edges) and yaw (radians).
+        Row and column in the lattice of the scores, whose integers are the samples, and yaw (radians).
+    yaws, widths
+        (R,) what `quadrature` drew; the fine headings alone (the first `quadrature.fine`) will do.
     metres_per_cell
-        Size of a feature cell.
+        Spacing of the lattice.
     """
     row, col, yaw = truth
-    yaws, widths = (drawn.to(scan_features.device) for drawn in quadrature.draw(yaw, generator))
-    scores = vote(map_features, scan_features, yaws, chunk=len(yaws))
     log_cell = torch.log(widths) + 2 * math.log(metres_per_cell)
     normaliser = torch.logsumexp(scores.flatten(1) + log_cell[:, None], dim=(0, 1))
-    half = scan_features.shape[-1] / 2
-    middle = torch.stack([scores[k] for k in _neighbours(yaws, yaw, quadrature.fine)])
-    weight = float((yaw - yaws[_neighbours(yaws, yaw, quadrature.fine)[0]]) / math.radians(quadrature.fine_step_deg))
-    at_yaw = torch.lerp(
-        _bilinear(middle[0], row - half, col - half), _bilinear(middle[1], row - half, col - half), weight
-    )
+    below, above = _neighbours(yaws, yaw, quadrature.fine)
+    weight = float((yaw - yaws[below]) / math.radians(quadrature.fine_step_deg))
+    at_yaw = torch.lerp(_bilinear(scores[below], row, col), _bilinear(scores[above], row, col), weight)
     return normaliser - at_yaw
 
 

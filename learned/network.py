@@ -6,6 +6,7 @@ settings and turned into a matcher. `learned.architectures.ARCHITECTURES` lists 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Protocol, Self
@@ -180,6 +181,8 @@ class Architecture:
         weights fit one reach alone.
     version
         Raised when weights of before no longer fit.
+    factored
+        Whether the heading is predicted apart from the position, so that its calibration gets a parameter of its own.
     """
 
     name: str
@@ -188,6 +191,7 @@ class Architecture:
     matcher: Callable[[Any, Calibration], NetworkMatcher]
     reaching: Callable[[Any, float], LocalizationNet] | None = None
     version: int = 1
+    factored: bool = False
 
     @property
     def tag(self) -> str:
@@ -198,3 +202,12 @@ class Architecture:
 def picture_tensor(picture: NDArray[np.uint8]) -> Tensor:
     """(rows, cols, 3) uint8 -> (3, rows, cols) float32 in [0, 1]."""
     return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float() / 255.0
+
+
+def on_cpu(net: LocalizationNet) -> LocalizationNet:
+    """The network itself if it is on the CPU, else a copy that is."""
+    if all(parameter.device.type == "cpu" for parameter in net.parameters()):
+        return net
+    copied = copy.deepcopy(net)
+    copied.to(torch.device("cpu"))
+    return copied

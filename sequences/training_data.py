@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from learned.bev import BevSettings, bev_counts
 from learned.samples import SAMPLE_METRES_PER_PIXEL, UNKNOWN_PLACE, Sample, cut_sample
 from sequences.lidar import LidarModel, simulate_scan
 from sequences.osm import MapFeatures
+from sequences.sample_cache import claim_cache
 from sequences.world import World, build_area, sample_road_poses
 from sequences.world_style import WorldStyle
 
@@ -73,7 +74,13 @@ class SimulatedSamples:
     settings
         How samples are made.
     cache_dir
-        Where finished areas are kept; it must not be shared between different settings or extracts.
+        Where finished areas are kept. Runs with the same extracts and settings may share it, however many samples
+        each takes; for others it is refused.
+
+    Raises
+    ------
+    SkyfixError
+        If there is no extract, or the cache holds samples made otherwise.
     """
 
     def __init__(
@@ -87,7 +94,9 @@ class SimulatedSamples:
         self.settings = settings
         self.cache_dir = cache_dir
         self._held: dict[int, list[Sample]] = {}
-        cache_dir.mkdir(parents=True, exist_ok=True)
+        how = asdict(settings)
+        del how["samples"]
+        claim_cache(cache_dir, extracts, how)
 
     def __len__(self) -> int:
         return self.settings.samples
@@ -106,7 +115,7 @@ class SimulatedSamples:
         Samples of one group are made or read together; a full shuffle would make an area for every sample.
         """
         per_area = self.settings.samples_per_area
-        areas = rng.permutation(-(-len(self) // per_area))
+        areas = rng.permutation(self.areas)
         groups = []
         for first in range(0, len(areas), _AREAS_MIXED):
             group = areas[first : first + _AREAS_MIXED, None] * per_area + np.arange(per_area)
@@ -114,9 +123,21 @@ class SimulatedSamples:
         order = np.concatenate(groups)
         return order[order < len(self)]
 
+    @property
+    def areas(self) -> int:
+        """Number of neighbourhoods that the samples are from."""
+        return -(-len(self) // self.settings.samples_per_area)
+
+    def missing_areas(self) -> list[int]:
+        """Those that are not in the cache yet."""
+        return [number for number in range(self.areas) if not self._path(number).exists()]
+
+    def _path(self, number: int) -> Path:
+        return self.cache_dir / f"area_{number:05d}.npz"
+
     def area(self, number: int) -> list[Sample]:
         """All samples of an area, from the cache or made now."""
-        path = self.cache_dir / f"area_{number:05d}.npz"
+        path = self._path(number)
         if path.exists():
             with np.load(path) as data:
                 poses = data["poses"].tolist()

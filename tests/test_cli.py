@@ -27,6 +27,7 @@ from sequences.progress import ConsoleProgress
 from sequences.run_result import FrameRow
 from sequences.tables import ROWS
 from sequences.track_settings import TrackSettings
+from sequences.train_command import TrainOptions
 
 
 @dataclass(frozen=True)
@@ -221,18 +222,29 @@ def test_demo_tracks_the_demo_sequence(
 def test_train_is_handed_its_files_and_shows_its_steps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def train(config: Path, data: Path, out: Path, progress: Callable[[int, int, float, float | None], None]) -> Path:
+    def train(
+        config: Path,
+        data: Path,
+        out: Path,
+        progress: Callable[[int, int, float, float | None], None],
+        options: TrainOptions,
+    ) -> Path:
         assert (config, data, out) == (Path("net.yaml"), Path("osm"), tmp_path)
+        assert options == TrainOptions(("training.seed=1", "training.batch=4"), 2.5, Path("samples"), True)
         for step in range(1, 121):
             progress(step, 120, 1.5, None if step < 100 else 2.25)
         return out / "rotmatch.safetensors"
 
     monkeypatch.setattr(sequences.train_command, "train_from_config", train)
-    done = skyfix(capsys, monkeypatch, "train", "net.yaml", "--data", "osm", "--out", str(tmp_path))
+    files = ["net.yaml", "--data", "osm", "--out", str(tmp_path), "--cache", "samples"]
+    how = ["--set", "training.seed=1", "--set", "training.batch=4", "--minutes", "2.5", "--tensorboard"]
+    done = skyfix(capsys, monkeypatch, "train", *files, *how)
     assert done.code == 0
     assert done.out == f"checkpoint: {tmp_path / 'rotmatch.safetensors'}\n"
     steps = ["step 50/120: loss 1.500", "step 100/120: loss 1.500, validation 2.250"]
     assert done.err.splitlines() == [*steps, "step 120/120: loss 1.500, validation 2.250"]
+    monkeypatch.setenv("RANK", "1")
+    assert skyfix(capsys, monkeypatch, "train", *files, *how).out == ""
 
 
 @pytest.mark.parametrize("terminal", [True, False])

@@ -10,7 +10,8 @@ import pytest
 from fusion.errors import SkyfixError
 from learned.matcher import load_matcher
 from sequences.osm import read_osm
-from sequences.train_command import read_config, train_from_config
+from sequences.train_command import train_from_config
+from sequences.train_config import read_config
 from sequences.training_data import SimulatedSamples, SimulationSettings
 
 TINY = """

@@ -1,72 +1,20 @@
-"""Samples, loss and training: geometry survives augmentation, resuming changes nothing, the loss is a density."""
+"""The loss is a density, resuming changes nothing, and RotMatch learns."""
 
 import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from landmarks import Landmarks
 
 from fusion.errors import SkyfixError
-from learned.losses import HeadingQuadrature, truth_nll
-from learned.map_raster import CLASS_INDEX
+from learned.losses import HeadingQuadrature, scores_nll
 from learned.rotmatch import RotMatchSettings
-from learned.samples import Augmentation, Sample, augment
-from learned.training import TrainingSettings, train
+from learned.samples import Augmentation
+from learned.training import NetworkChoice, TrainingSettings, train
 
-WALL = CLASS_INDEX["wall"]
 PLAIN = Augmentation(drop_class=0.0, thin=0.0, shorten=0.0, drop_sector=0.0, drop_band=0.0)
-
-
-def landmark_sample(seed: int) -> Sample:
-    """Random wall blocks on a map, and the body-height returns that a vehicle among them would have."""
-    rng = np.random.default_rng(seed)
-    row, col, yaw = 168 + rng.uniform(-4, 4), 168 + rng.uniform(-4, 4), rng.uniform(-math.pi, math.pi)
-    classes = np.zeros((336, 336), np.uint8)
-    counts = np.zeros((4, 160, 160), np.uint8)
-    for _ in range(40):
-        ahead, left = rng.uniform(-74, 74, 2)
-        top = row - (math.sin(yaw) * ahead + math.cos(yaw) * left)
-        side = col + (math.cos(yaw) * ahead - math.sin(yaw) * left)
-        classes[round(top) - 2 : round(top) + 2, round(side) - 2 : round(side) + 2] = WALL
-        counts[1, round(80 - left) - 2 : round(80 - left) + 2, round(80 + ahead) - 2 : round(80 + ahead) + 2] = 30
-    return Sample(counts, classes, row, col, yaw)
-
-
-class Landmarks:
-    """A sample source of landmark samples."""
-
-    def __init__(self, count: int) -> None:
-        self.samples = [landmark_sample(seed) for seed in range(count)]
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-    def __getitem__(self, index: int) -> Sample:
-        return self.samples[index]
-
-    def order(self, rng: np.random.Generator) -> np.ndarray:
-        return rng.permutation(len(self))
-
-
-@given(seed=st.integers(0, 10_000))
-@settings(max_examples=25)
-def test_augmentation_moves_truth_scan_and_map_together(seed: int) -> None:
-    example = augment(landmark_sample(seed % 7), np.random.default_rng(seed), PLAIN)
-    rows, cols = np.nonzero(example.density[1])
-    ahead, left = cols + 0.5 - 80, 80 - (rows + 0.5)
-    top = example.row - (math.sin(example.yaw) * ahead + math.cos(example.yaw) * left)
-    side = example.col + (math.cos(example.yaw) * ahead - math.sin(example.yaw) * left)
-    seen = (top > 4) & (top < 252) & (side > 4) & (side < 252)
-    walls = (example.picture == example.picture.max(axis=(0, 1))).all(axis=-1)
-    near = np.array(
-        [walls[int(t) - 3 : int(t) + 4, int(s) - 3 : int(s) + 4].any() for t, s in zip(top, side, strict=True)]
-    )
-    assert seen.sum() > 50
-    assert near[seen].mean() > 0.99
 
 
 def test_quadrature_covers_the_circle_once() -> None:
@@ -80,15 +28,20 @@ def test_quadrature_covers_the_circle_once() -> None:
         assert float(ends[-1]) < 2 * math.pi
 
 
-def test_nll_of_blind_features_is_that_of_a_uniform_density() -> None:
-    nll = truth_nll(
-        torch.zeros(2, 32, 32), torch.zeros(2, 16, 16), (15.2, 16.9, 0.3), 1.0, HeadingQuadrature(), torch.Generator()
-    )
+def test_nll_of_equal_scores_is_that_of_a_uniform_density() -> None:
+    quadrature = HeadingQuadrature()
+    yaws, widths = quadrature.draw(0.3, torch.Generator())
+    nll = scores_nll(torch.zeros(len(yaws), 17, 17), (7.2, 8.9, 0.3), yaws, widths, 1.0, quadrature)
     assert float(nll) == pytest.approx(math.log(17 * 17 * 2 * math.pi), rel=1e-5)
 
 
 TINY = TrainingSettings(
-    steps=6, batch=2, workers=0, validate_every=3, warmup_steps=2, network=RotMatchSettings(4, (4, 4, 8, 8))
+    steps=6,
+    batch=2,
+    workers=0,
+    validate_every=3,
+    warmup_steps=2,
+    network=NetworkChoice(settings=RotMatchSettings(4, (4, 4, 8, 8))),
 )
 
 
