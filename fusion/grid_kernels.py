@@ -274,3 +274,23 @@ def plane_moments(mass: Float32Array) -> FloatArray:
             sums[k, 5] += second
             sums[k, 6] += square
     return sums
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def reweigh(
+    mass: Float32Array, weights: Float32Array, gain: float, fresh: float, floor: float
+) -> float:
+    """Put ``(gain * mass + fresh) * weights``, at least `floor`, in place of the weights; the sum of that."""
+    planes, rows, cols = mass.shape
+    factor, extra, least = np.float32(gain), np.float32(fresh), np.float32(floor)
+    total = 0.0
+    for k in range(planes):
+        for r in range(rows):
+            line, target = mass[k, r], weights[k, r]
+            row_sum = np.float32(0.0)
+            for c in range(cols):
+                value = max((factor * line[c] + extra) * target[c], least)
+                target[c] = value
+                row_sum += value
+            total += np.float64(row_sum)
+    return total

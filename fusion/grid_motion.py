@@ -31,6 +31,7 @@ from fusion.errors import SkyfixError
 from fusion.grid_kernels import DIRECTIONS, mass_mixed_away, mix_headings, selling, translate
 from fusion.odometry import OdometryIncrement
 from fusion.pose_lattice import PoseLattice
+from fusion.scratch import Scratch
 
 _THREE_TAPS = 1.0 / 3.0  # variance in cells squared up to which three taps are enough
 _RADIUS_SIGMAS = 5.0
@@ -182,31 +183,36 @@ class GridMotion:
         radii = (taps > 0.0).sum(axis=2) - 1
         return cls(lattice, after, steps.astype(np.int64), directions, taps, radii, mix)
 
-    def apply(self, mass: Float32Array, out: Float32Array, gain: float = 1.0, floor: float = 0.0) -> float:
+    def apply(
+        self, mass: Float32Array, out: Float32Array, scratch: Scratch, gain: float = 1.0, floor: float = 0.0
+    ) -> float:
         """Mass (K, rows, cols) after the motion, times `gain` and at least `floor`, into `out`; what left the map."""
         if self.mix is None:
             return float(translate(mass, out, self.steps, self.directions, self.taps, self.radii, gain, floor))
         mix = self.mix
-        framed = _framed(mass, mix.frame)
+        framed = _framed(mass.shape, mix.frame, scratch)
         left = translate(mass, framed, self.steps, self.directions, self.taps, self.radii, gain, 0.0)
         left += mass_mixed_away(framed, mix.frame, mix.weights, mix.cells, mix.parts)
         mix_headings(framed, out, mix.centre, mix.weights, *mix.gathered(), floor)
         return float(left)
 
-    def adjoint(self, values: Float32Array, out: Float32Array, gain: float = 1.0) -> None:
+    def adjoint(self, values: Float32Array, out: Float32Array, scratch: Scratch, gain: float = 1.0) -> None:
         """Expected value after the motion for every cell before it, times `gain`; zero beyond the map."""
         if self.mix is not None:
             frame = self.mix.frame
-            framed = _framed(values, frame)
+            framed = _framed(values.shape, frame, scratch)
             framed[:, frame:-frame, frame:-frame] = values
             values = np.empty_like(values)
             mix_headings(framed, values, self.mix.centre, self.mix.weights, *self.mix.transposed(), 0.0)
         translate(values, out, -self.steps, self.directions, self.taps, self.radii, gain, 0.0)
 
 
-def _framed(mass: Float32Array, frame: int) -> Float32Array:
-    planes, rows, cols = mass.shape
-    return np.zeros((planes, rows + 2 * frame, cols + 2 * frame), dtype=np.float32)
+def _framed(shape: tuple[int, ...], frame: int, scratch: Scratch) -> Float32Array:
+    """Room for planes (K, rows, cols) inside a frame of zeros."""
+    framed = scratch.take((shape[0], shape[1] + 2 * frame, shape[2] + 2 * frame))
+    framed[:, :frame] = framed[:, -frame:] = 0.0
+    framed[:, :, :frame] = framed[:, :, -frame:] = 0.0
+    return framed
 
 
 def _cells_from_xy(headings: FloatArray) -> FloatArray:
