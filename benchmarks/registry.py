@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from benchmarks import filter_step, smoother
+from benchmarks import filter_step, grid_filter, smoother
 from benchmarks.runner import Case, Row, time_case
 from fusion.errors import SkyfixError
 
-BENCHMARKS: dict[str, Callable[[], Iterator[Case]]] = {"filter_step": filter_step.cases, "smoother": smoother.cases}
+BENCHMARKS: dict[str, Callable[[], Iterator[Case]]] = {
+    "filter_step": filter_step.cases,
+    "grid_filter": grid_filter.cases,
+    "smoother": smoother.cases,
+}
 """From a benchmark's name to its cases at their full sizes."""
 
 

@@ -9,12 +9,14 @@ from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
+from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.pose_filter import PoseFilter, UpdateReport
+from fusion.pose_lattice import PoseLattice
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 
@@ -22,6 +24,8 @@ __all__ = [
     "Estimate",
     "GaussianLikelihood",
     "GaussianMixture",
+    "GridFilter",
+    "GridFilterSettings",
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
@@ -31,6 +35,7 @@ __all__ = [
     "ParticleFilter",
     "ParticleFilterSettings",
     "PoseFilter",
+    "PoseLattice",
     "PoseLikelihood",
     "SkyfixError",
     "SmootherResult",

@@ -191,7 +191,8 @@ class GridFilter:
         found = look_up(measurement, self._lattice, self._spare, self._scratch)
         kidnapped = self.settings.kidnap_probability
         gain = (1.0 - kidnapped) * _WHOLE / self._total
-        inside = float(reweigh(self._mass, self._spare, gain, kidnapped * _WHOLE / self._mass.size, _LEAST))
+        fresh = kidnapped * _WHOLE / self._mass.size
+        inside, squares = reweigh(self._mass, self._spare, gain, fresh, _LEAST)
         outside = gain * self._outside * found.outside
         evidence = (inside + outside) / _WHOLE
         if not (np.isfinite(evidence) and evidence > _LEAST_EVIDENCE):
@@ -199,8 +200,7 @@ class GridFilter:
         self._mass, self._spare = self._spare, self._mass
         self._outside, self._total = outside, inside + outside
         self._log_evidence = float(np.log(evidence)) + found.log_scale
-        size = grid_moments(self._mass, self._lattice).effective_cells
-        return UpdateReport(self._log_evidence, size, lost_score=self.outside_probability)
+        return UpdateReport(self._log_evidence, inside**2 / squares, lost_score=self.outside_probability)
 
     def estimate(self, stamp_ns: int, max_modes: int = 0) -> Estimate:
         """Summary of the mass on the map; with its `max_modes` heaviest modes when that is not 0."""

@@ -229,11 +229,12 @@ def mass_mixed_away(framed: Float32Array, frame: int, weights: Float32Array, cel
         for m in range(neighbours):
             for r in range(rows):
                 kept_row = _kept(r + cells[k, m, 0], rows, parts[k, m, 0])
-                skip = kept_row == 1.0 and cols > 2 * frame
+                inner = min(max(0, -cells[k, m, 1]), cols), max(0, cols - max(0, cells[k, m, 1] + 1))
                 c = 0
                 while c < cols:
-                    if skip and c == frame:
-                        c = cols - frame
+                    if kept_row == 1.0 and inner[0] <= c < inner[1]:
+                        c = inner[1]  # nothing is lost between the two
+                        continue
                     kept = kept_row * _kept(c + cells[k, m, 1], cols, parts[k, m, 1])
                     total += weights[m] * (1.0 - kept) * framed[k, frame + r, frame + c]
                     c += 1
@@ -279,18 +280,17 @@ def plane_moments(mass: Float32Array) -> FloatArray:
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def reweigh(
     mass: Float32Array, weights: Float32Array, gain: float, fresh: float, floor: float
-) -> float:
-    """Put ``(gain * mass + fresh) * weights``, at least `floor`, in place of the weights; the sum of that."""
+) -> tuple[float, float]:
+    """Put ``(gain * mass + fresh) * weights``, at least `floor`, in place of the weights; its sum and sum of squares."""
     planes, rows, cols = mass.shape
     factor, extra, least = np.float32(gain), np.float32(fresh), np.float32(floor)
-    total = 0.0
+    total = squares = 0.0
     for k in range(planes):
         for r in range(rows):
             line, target = mass[k, r], weights[k, r]
-            row_sum = np.float32(0.0)
             for c in range(cols):
                 value = max((factor * line[c] + extra) * target[c], least)
                 target[c] = value
-                row_sum += value
-            total += np.float64(row_sum)
-    return total
+                total += np.float64(value)
+                squares += np.float64(value) * np.float64(value)
+    return total, squares
