@@ -1,10 +1,10 @@
 """One step of a grid filter, predict and update, on 64 headings of 256 x 256 cells, from a `LikelihoodVolume` on.
 
 The peer is what one writes with scipy: every plane shifted by its rotated motion (`ndimage.shift`, linear) and blurred
-(`gaussian_filter`), all planes turned and blurred across headings, then multiplied by the likelihood. Its layout is that
-of skyfix, heading first, in float32, which is also its fastest. The motion is one that scipy can do as well: noise that is
-the same along and across and apart from the heading, and wide enough for scipy to take out again what its linear shift
-adds to the variance. Then both have the same mean and covariance and nearly the same posterior.
+(`gaussian_filter`), all planes turned and blurred across headings, then multiplied by the likelihood. Its layout is
+that of skyfix, heading first, in float32. The motion is one that scipy can do as well: noise that is the same along and
+across and independent of the heading's, and wide enough to take out of the blur what a linear shift adds to the
+variance. Then both have nearly the same mean, covariance and posterior.
 """
 
 from __future__ import annotations

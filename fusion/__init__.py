@@ -10,6 +10,8 @@ from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.grid_filter import GridFilter, GridFilterSettings
+from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
+from fusion.kalman_filter import KalmanFilter, KalmanFilterSettings
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
@@ -26,6 +28,9 @@ __all__ = [
     "GaussianMixture",
     "GridFilter",
     "GridFilterSettings",
+    "GridSmootherResult",
+    "KalmanFilter",
+    "KalmanFilterSettings",
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
@@ -47,4 +52,5 @@ __all__ = [
     "find_modes",
     "increments_at",
     "smooth",
+    "smooth_on_grid",
 ]

@@ -138,9 +138,7 @@ def translate(
                 middle[c] = factor * values[c]
         for d in range(DIRECTIONS):
             if radii[k, d] > 0:
-                _blur_along(
-                    one, other, taps[k, d], radii[k, d], directions[k, d, 0], directions[k, d, 1], widest
-                )
+                _blur_along(one, other, taps[k, d], radii[k, d], directions[k, d, 0], directions[k, d, 1], widest)
                 one, other = other, one
         # the window of the blurred plane that lands on the map
         top = min(max(pad - steps[k, 0], 0), rows + 2 * pad)
@@ -216,7 +214,9 @@ def mix_headings(
 
 
 @numba.njit(cache=True, nogil=True)
-def mass_mixed_away(framed: Float32Array, frame: int, weights: Float32Array, cells: IntArray, parts: Float32Array) -> float:
+def mass_mixed_away(
+    framed: Float32Array, frame: int, weights: Float32Array, cells: IntArray, parts: Float32Array
+) -> float:
     """Mass that :func:`mix_headings` moves beyond the edges.
 
     Here the tables say where mass goes: from cell (r, c) of plane k to row ``r + cells`` and the next, which gets the
@@ -278,9 +278,7 @@ def plane_moments(mass: Float32Array) -> FloatArray:
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def reweigh(
-    mass: Float32Array, weights: Float32Array, gain: float, fresh: float, floor: float
-) -> tuple[float, float]:
+def reweigh(mass: Float32Array, weights: Float32Array, gain: float, fresh: float, floor: float) -> tuple[float, float]:
     """Put ``(gain * mass + fresh) * weights``, at least `floor`, in place of the weights; its sum and sum of squares."""
     planes, rows, cols = mass.shape
     factor, extra, least = np.float32(gain), np.float32(fresh), np.float32(floor)

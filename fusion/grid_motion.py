@@ -25,7 +25,6 @@ from typing import Self
 
 import numpy as np
 
-from fusion import se2
 from fusion.arrays import Float32Array, FloatArray, IntArray
 from fusion.errors import SkyfixError
 from fusion.grid_kernels import DIRECTIONS, mass_mixed_away, mix_headings, selling, translate
@@ -101,7 +100,9 @@ class _HeadingMix:
         targets = (np.arange(len(offsets))[:, None] + jumps) % len(offsets)
         shift = offsets[:, None] - offsets[targets] + carried[:, None] * jumps[:, None]
         cells = np.floor(shift)
-        return cls(float(half[0]), half[np.abs(jumps)], jumps, cells.astype(np.int64), (shift - cells).astype(np.float32))
+        return cls(
+            float(half[0]), half[np.abs(jumps)], jumps, cells.astype(np.int64), (shift - cells).astype(np.float32)
+        )
 
     @property
     def excess(self) -> FloatArray:
