@@ -279,7 +279,7 @@ def plane_moments(mass: Float32Array) -> FloatArray:
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def reweigh(mass: Float32Array, weights: Float32Array, gain: float, fresh: float, floor: float) -> tuple[float, float]:
-    """Put ``(gain * mass + fresh) * weights``, at least `floor`, in place of the weights; its sum and sum of squares."""
+    """Put ``(gain * mass + fresh) * weights``, at least `floor`, in place of the weights; sum and sum of squares."""
     planes, rows, cols = mass.shape
     factor, extra, least = np.float32(gain), np.float32(fresh), np.float32(floor)
     total = squares = 0.0

@@ -10,11 +10,11 @@ is the same for all cells, so the operator is two steps.
    by its conditional mean ``Q_pt / Q_tt e``, which is how a heading error during the motion carries it sideways.
    The turn itself moves nothing: it turns the lattice.
 
-Every kernel is a Gaussian sampled at whole cells whose width is chosen such that its variance is exact, however narrow:
-``(v / 2, 1 - v, v / 2)`` for v cells squared below a third. Means are exact. Only step 2 splits mass between cells, as the
-planes' offsets differ; the variance ``f (1 - f)`` that it adds to its small share is taken out of the blur of step 1. So
-the first two moments of the prediction at every heading are those of the model, as long as the blur is wide enough to
-give that much, and no narrower across than 1/16 of its length (it is widened to that).
+Every kernel is a Gaussian sampled at whole cells whose width is chosen such that its variance is exact, however
+narrow: ``(v / 2, 1 - v, v / 2)`` for v cells squared below a third. Means are exact. Only step 2 splits mass between
+cells, as the planes' offsets differ; the variance ``f (1 - f)`` that it adds to its small share is taken out of the
+blur of step 1. So the first two moments of the prediction at every heading are those of the model, as long as the blur
+is wide enough to give that much, and no narrower across than 1/16 of its length (it is widened to that).
 
 Source: Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, 8.2 (grid localization); the factorisation is that of a
 Gaussian into a marginal and a conditional.
@@ -74,7 +74,7 @@ def _sampled_gaussians(variances: FloatArray, radius: int) -> FloatArray:
     rate = 0.5 / variances  # weights exp(-rate n^2); d variance / d rate = variance^2 - fourth moment
     for _ in range(_NEWTON_STEPS):
         weights = inside * np.exp(-rate[:, None] * n**2)
-        weights /= (weights @ twice)[:, None]
+        weights = weights / (weights @ twice)[:, None]
         second, fourth = weights @ (twice * n**2), weights @ (twice * n**4)
         rate = rate + (second - variances) / (fourth - second**2)
     weights = inside * np.exp(-rate[:, None] * n**2)

@@ -10,8 +10,8 @@ recovery. Its evidence knows one mode of the likelihood and none of its skirts. 
 these things; where the prediction and the measurement are Gaussian all three agree.
 
 Sources: Julier, Uhlmann, "New extension of the Kalman filter to nonlinear systems", 1997; van der Merwe's scaled sigma
-points in filterpy; gating: Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001,
-section 2.3.
+points in filterpy; gating: Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation",
+2001, section 2.3.
 """
 
 from collections.abc import Callable

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from fusion import se2
-from fusion.arrays import FloatArray, checked, read_only
+from fusion.arrays import FloatArray, IntArray, checked, read_only
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 
@@ -75,9 +75,8 @@ class PoseLattice:
         centres = np.stack([row, col], axis=-1) + 0.5 + self.offsets[plane]
         return np.column_stack([self.grid.xy_from_pixel(centres), np.full(len(row), self.headings[plane])])
 
-    def at(self, cells: FloatArray) -> FloatArray:
+    def at(self, cells: IntArray) -> FloatArray:
         """Poses (N, 3) of cells (N, 3) given as (plane, row, col)."""
-        cells = np.asarray(cells)
-        plane = cells[:, 0].astype(np.int64)
+        plane = cells[:, 0]
         xy = self.grid.xy_from_pixel(cells[:, 1:] + 0.5 + self.offsets[plane])
         return np.column_stack([xy, self.headings[plane]])
