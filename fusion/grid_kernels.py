@@ -30,7 +30,9 @@ def selling(tensors: FloatArray, directions: IntArray, variances: FloatArray) ->
     for k in range(tensors.shape[0]):
         xx, xy, yy = tensors[k, 0, 0], tensors[k, 0, 1], tensors[k, 1, 1]
         slack = 1e-12 * (xx + yy)
-        base[0], base[1], base[2] = (-1, -1), (1, 0), (0, 1)
+        base[:] = 0
+        base[0, 0] = base[0, 1] = -1
+        base[1, 0] = base[2, 1] = 1
         settled = 0
         i = 0
         while settled < 3:

@@ -52,10 +52,9 @@ def poses_of(lattice):
 
 
 def volume(scores=None, bins=36, grid=GRID, seed=0):
-    rng = np.random.default_rng(seed)
-    return LikelihoodVolume.from_scores(
-        rng.normal(0, 2, (grid.rows, grid.cols, bins)) if scores is None else scores, grid
-    )
+    if scores is None:
+        scores = np.random.default_rng(seed).normal(0, 2, (grid.rows, grid.cols, bins))
+    return LikelihoodVolume.from_scores(scores, grid)
 
 
 # --- kernels -------------------------------------------------------------------------------------------------------
