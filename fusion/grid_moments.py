@@ -60,7 +60,8 @@ def grid_moments(mass: Float32Array, lattice: PoseLattice) -> GridMoments:
 
 def _widened(covariance: FloatArray, cell: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(covariance / np.outer(cell, cell))
-    return np.asarray((vectors * np.maximum(values, _INSIDE_A_CELL)) @ vectors.T * np.outer(cell, cell))
+    widened = (vectors * np.maximum(values, _INSIDE_A_CELL)) @ vectors.T * np.outer(cell, cell)
+    return np.asarray(0.5 * (widened + widened.T))
 
 
 def grid_modes(mass: Float32Array, lattice: PoseLattice, k: int) -> GaussianMixture:

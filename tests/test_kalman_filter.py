@@ -1,4 +1,4 @@
-"""The unscented Kalman filter: a Kalman filter where that is exact, honest about its one mode, unharmed by bad input."""
+"""The unscented Kalman filter: exact where a Kalman filter is, honest about its one mode, unharmed by bad input."""
 
 from __future__ import annotations
 
