@@ -73,7 +73,7 @@ def symmetric_taps(variances: FloatArray) -> Float32Array:
 def _sampled_gaussians(variances: FloatArray, radius: int) -> FloatArray:
     """Gaussians sampled at 0 .. radius, each cut off at its own radius, whose variances are exact: Newton's method."""
     n = np.arange(radius + 1)
-    inside = n <= np.ceil(_RADIUS_SIGMAS * np.sqrt(variances))[:, None]
+    inside = (n <= np.ceil(_RADIUS_SIGMAS * np.sqrt(variances))[:, None]).astype(np.float64)
     twice = np.where(n == 0, 1.0, 2.0)
     rate = 0.5 / variances  # weights exp(-rate n^2); d variance / d rate = variance^2 - fourth moment
     for _ in range(_NEWTON_STEPS):
