@@ -9,6 +9,9 @@ from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
+from fusion.grid_filter import GridFilter, GridFilterSettings
+from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
+from fusion.kalman_filter import KalmanFilter, KalmanFilterSettings
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
@@ -16,6 +19,7 @@ from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increm
 from fusion.odometry_calibration import OdometryCalibration, calibrate_odometry
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.pose_filter import PoseFilter, UpdateReport
+from fusion.pose_lattice import PoseLattice
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 
@@ -23,6 +27,11 @@ __all__ = [
     "Estimate",
     "GaussianLikelihood",
     "GaussianMixture",
+    "GridFilter",
+    "GridFilterSettings",
+    "GridSmootherResult",
+    "KalmanFilter",
+    "KalmanFilterSettings",
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
@@ -33,6 +42,7 @@ __all__ = [
     "ParticleFilter",
     "ParticleFilterSettings",
     "PoseFilter",
+    "PoseLattice",
     "PoseLikelihood",
     "SkyfixError",
     "SmootherResult",
@@ -45,4 +55,5 @@ __all__ = [
     "find_modes",
     "increments_at",
     "smooth",
+    "smooth_on_grid",
 ]
