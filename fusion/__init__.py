@@ -3,6 +3,14 @@
 This package knows nothing of networks, sensors or files, so that any likelihood and any odometry can be plugged in.
 """
 
+from fusion.emulated_likelihood import EmulatedLikelihood
+from fusion.error_profile import (
+    FG2_KITTI_SAME_AREA,
+    ORIENTERNET_KITTI_SEQUENTIAL,
+    TRANSLOCNET_KITTI,
+    ErrorProfile,
+    PublishedFigures,
+)
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
@@ -10,6 +18,7 @@ from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
+from fusion.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
@@ -19,9 +28,16 @@ from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 
 __all__ = [
+    "FG2_KITTI_SAME_AREA",
+    "ORIENTERNET_KITTI_SEQUENTIAL",
+    "TRANSLOCNET_KITTI",
+    "EmulatedLikelihood",
+    "EmulatorSettings",
+    "ErrorProfile",
     "Estimate",
     "GaussianLikelihood",
     "GaussianMixture",
+    "LikelihoodEmulator",
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
@@ -32,6 +48,7 @@ __all__ = [
     "ParticleFilterSettings",
     "PoseFilter",
     "PoseLikelihood",
+    "PublishedFigures",
     "SkyfixError",
     "SmootherResult",
     "SmootherSettings",
