@@ -3,6 +3,7 @@
 This package knows nothing of networks, sensors or files, so that any likelihood and any odometry can be plugged in.
 """
 
+from fusion.cloud_history import CloudHistory, RecordedCloud
 from fusion.emulated_likelihood import EmulatedLikelihood
 from fusion.error_profile import (
     FG2_KITTI_SAME_AREA,
@@ -23,6 +24,7 @@ from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.particle_smoother import ParticleSmootherSettings, PathSamples, sample_paths
 from fusion.pose_filter import PoseFilter, UpdateReport
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
@@ -31,6 +33,7 @@ __all__ = [
     "FG2_KITTI_SAME_AREA",
     "ORIENTERNET_KITTI_SEQUENTIAL",
     "TRANSLOCNET_KITTI",
+    "CloudHistory",
     "EmulatedLikelihood",
     "EmulatorSettings",
     "ErrorProfile",
@@ -46,9 +49,12 @@ __all__ = [
     "OutlierMixture",
     "ParticleFilter",
     "ParticleFilterSettings",
+    "ParticleSmootherSettings",
+    "PathSamples",
     "PoseFilter",
     "PoseLikelihood",
     "PublishedFigures",
+    "RecordedCloud",
     "SkyfixError",
     "SmootherResult",
     "SmootherSettings",
@@ -58,5 +64,6 @@ __all__ = [
     "accumulate",
     "find_modes",
     "increments_at",
+    "sample_paths",
     "smooth",
 ]
