@@ -5,6 +5,7 @@ This package knows nothing of networks, sensors or files, so that any likelihood
 
 from fusion.cloud_history import CloudHistory, RecordedCloud
 from fusion.emulated_likelihood import EmulatedLikelihood
+from fusion.error_correlation import ErrorCorrelation, estimate_error_correlation
 from fusion.error_profile import (
     FG2_KITTI_SAME_AREA,
     ORIENTERNET_KITTI_SEQUENTIAL,
@@ -36,6 +37,7 @@ __all__ = [
     "CloudHistory",
     "EmulatedLikelihood",
     "EmulatorSettings",
+    "ErrorCorrelation",
     "ErrorProfile",
     "Estimate",
     "GaussianLikelihood",
@@ -62,6 +64,7 @@ __all__ = [
     "UniformPrior",
     "UpdateReport",
     "accumulate",
+    "estimate_error_correlation",
     "find_modes",
     "increments_at",
     "sample_paths",

@@ -4,7 +4,7 @@ Everything is a density of the vehicle's pose seen from the answer, ``answer^-1 
 that errors along and across the vehicle can differ. The map from there to poses on the map's axes is volume preserving.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -147,19 +147,12 @@ class EmulatedLikelihood:
         return GaussianMixture(self.weights[chosen], means, covariances).tempered(self.temperature)
 
     def tempered(self, temperature: float) -> "EmulatedLikelihood":
-        """The density to the power 1 / temperature, normalised by cells, to about a percent."""
+        """The density to the power 1 / temperature; normalised by cells, to about a percent, if it is a mixture."""
         if checked_temperature(temperature) == 1.0:
             return self
-        return EmulatedLikelihood(
-            self.answer,
-            self.half_box,
-            self.weights,
-            self.centres,
-            self.sigmas,
-            self.halves,
-            self.temperature * temperature,
-            self.floor,
-        )
+        if len(self.weights) == 1:
+            return replace(self, sigmas=self.sigmas * np.sqrt(temperature))
+        return replace(self, temperature=self.temperature * temperature)
 
     def with_outliers(self, probability: float) -> OutlierMixture:
         """Allow for a measurement that says nothing: mix in the uniform density over the crop."""
