@@ -126,7 +126,7 @@ def test_nis_of_a_consistent_prediction_is_the_dimension():
     assert low < nis(innovations, *many).mean() < high
 
 
-def tracked(handled, seed, rho=0.9, steps=500):
+def tracked(handled, seed, rho=0.9, steps=400):
     """NEES per degree of freedom of a filter on emulated measurements whose errors repeat from frame to frame."""
     profile = ErrorProfile("emulated Gaussian", (0.8, 0.8, 0.03), (0.8, 0.8, 0.03), 0.0)
     rng = np.random.default_rng(seed)
@@ -151,9 +151,9 @@ def tracked(handled, seed, rho=0.9, steps=500):
 
 
 def test_repeating_errors_are_put_right_in_a_filter():
-    """Correlation 0.9 from step to step, six fixed seeds of 500 steps: NEES per degree of freedom in [0.8, 1.25]."""
-    assert 0.8 <= np.mean([tracked(True, seed) for seed in range(6)]) <= 1.25
-    assert np.mean([tracked(False, seed) for seed in range(2)]) > 3.0
+    """Correlation 0.9 from step to step, four fixed seeds of 400 steps: NEES per degree of freedom in [0.8, 1.25]."""
+    assert 0.8 <= np.mean([tracked(True, seed) for seed in range(4)]) <= 1.25
+    assert np.mean([tracked(False, seed) for seed in range(1)]) > 3.0
 
 
 def test_the_emulator_s_correlation_is_found_again():
