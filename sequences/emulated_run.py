@@ -50,8 +50,10 @@ class EmulatedRunSettings:
         Of the filter, and at most kept of each cloud for the smoother.
     measure_every_m
         A measurement when the odometry has moved this far since the last one; 0 for every frame.
-    handle_correlation
-        Whether the filter flattens likelihoods whose errors repeat.
+    handled_length_m
+        Correlation length that the filter flattens likelihoods for: 0 takes errors for independent, None knows the
+        emulator's own. One found by `estimate_error_correlation` is what a user would have: errors with tails repeat
+        less than the Gaussians that they are drawn by.
     odometry_clock_s
         Moves the odometry's stamps, for an odometry whose clock is known to be off.
     noise, smoother
@@ -64,7 +66,7 @@ class EmulatedRunSettings:
     particles: int = 2000
     kept_particles: int = 2000
     measure_every_m: float = 4.0
-    handle_correlation: bool = True
+    handled_length_m: float | None = None
     odometry_clock_s: float = 0.0
     noise: OdometryNoise = field(default_factory=OdometryNoise)
     smoother: ParticleSmootherSettings = field(default_factory=lambda: ParticleSmootherSettings(paths=300))
@@ -76,12 +78,16 @@ class EmulatedRunSettings:
             raise SkyfixError(f"particles: expected >= 1, got {self.particles}")
         if not (np.isfinite(self.measure_every_m) and self.measure_every_m >= 0.0):
             raise SkyfixError(f"measure_every_m: expected 0 or more, got {self.measure_every_m}")
+        if self.handled_length_m is not None and not (
+            np.isfinite(self.handled_length_m) and self.handled_length_m >= 0
+        ):
+            raise SkyfixError(f"handled_length_m: expected 0 or more, got {self.handled_length_m}")
 
     def temperature(self, moved_m: float) -> float:
         """By how much the filter flattens a likelihood so far after the last one."""
         rho = self.emulator.step_correlation
-        if not self.handle_correlation:
-            return 1.0
+        if self.handled_length_m is not None:
+            return correlated_error_temperature(moved_m, self.handled_length_m)
         if rho is not None:
             return min((1.0 + rho) / (1.0 - rho), MAX_TEMPERATURE)
         return correlated_error_temperature(moved_m, self.emulator.correlation_length_m)

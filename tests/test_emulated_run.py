@@ -56,7 +56,7 @@ def test_settings_reach_the_run() -> None:
     assert EmulatedRunSettings(emulator=EmulatorSettings(step_correlation=0.9)).temperature(4.0) == pytest.approx(19.0)
     long = EmulatorSettings(correlation_length_m=4.0)
     assert EmulatedRunSettings(emulator=long).temperature(4.0) == pytest.approx((1 + np.exp(-1)) / (1 - np.exp(-1)))
-    assert EmulatedRunSettings(emulator=long, handle_correlation=False).temperature(4.0) == 1.0
+    assert EmulatedRunSettings(emulator=long, handled_length_m=0.0).temperature(4.0) == 1.0
     assert EmulatedRunSettings().temperature(4.0) == 1.0
 
 
@@ -65,6 +65,7 @@ def test_bad_settings_are_refused() -> None:
         "seed": lambda: EmulatedRunSettings(seed=-1),
         "particles": lambda: EmulatedRunSettings(particles=0),
         "measure_every_m": lambda: EmulatedRunSettings(measure_every_m=np.nan),
+        "handled_length_m": lambda: EmulatedRunSettings(handled_length_m=-1.0),
         "two poses": lambda: run_emulated(winding_drive(1), winding_drive(5)),
     }.items():
         with pytest.raises(SkyfixError, match=word):
