@@ -5,6 +5,10 @@ each time to a particle from which the odometry could have brought it where it i
 of the joint smoothing density of the recorded stamps, multimodal or not. Between records the odometry's own
 conditional density fills in the other stamps (see `odometry_bridge`).
 
+Where a filter was lost and drew particles anew, no odometry leads back: paths then go on from the particle nearest in
+the odometry's metric, and their spread says nothing of how wrong the cloud before was. As many nodes as measurements,
+a few metres apart, are better than many more: the finer the step, the fewer particles could have led to a particle.
+
 Sources: Godsill, Doucet, West, "Monte Carlo smoothing for nonlinear time series", JASA 2004; Douc, Garivier,
 Moulines, Olsson, "Sequential Monte Carlo smoothing for general state space hidden Markov models", Annals of Applied
 Probability 2011.

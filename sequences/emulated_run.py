@@ -21,6 +21,7 @@ from fusion.cloud_history import CloudHistory
 from fusion.consistency import MAX_TEMPERATURE, correlated_error_temperature
 from fusion.error_profile import TRANSLOCNET_KITTI, ErrorProfile
 from fusion.errors import SkyfixError
+from fusion.estimate import Estimate
 from fusion.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
 from fusion.odometry import OdometryNoise, increments_at
 from fusion.particle_filter import ParticleFilter
@@ -165,7 +166,9 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
     particles = ParticleFilter.from_prior(prior, settings.particles, streams[_FILTER_STREAM])
     emulator = LikelihoodEmulator(profile, streams[_MEASURE_STREAM], settings.emulator)
     history = CloudHistory(settings.kept_particles, settings.seed)
-    estimates, answers, since_m = [], {}, np.inf
+    estimates: list[Estimate] = []
+    answers: dict[int, FloatArray] = {}
+    since_m = np.inf
     for frame, stamp in enumerate(stamps.tolist()):
         if frame:
             increment = increments[frame - 1]
