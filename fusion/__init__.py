@@ -3,6 +3,16 @@
 This package knows nothing of networks, sensors or files, so that any likelihood and any odometry can be plugged in.
 """
 
+from fusion.cloud_history import CloudHistory, RecordedCloud
+from fusion.emulated_likelihood import EmulatedLikelihood
+from fusion.error_correlation import ErrorCorrelation, estimate_error_correlation
+from fusion.error_profile import (
+    FG2_KITTI_SAME_AREA,
+    ORIENTERNET_KITTI_SEQUENTIAL,
+    TRANSLOCNET_KITTI,
+    ErrorProfile,
+    PublishedFigures,
+)
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
@@ -13,17 +23,27 @@ from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
 from fusion.kalman_filter import KalmanFilter, KalmanFilterSettings
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
+from fusion.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
 from fusion.odometry_calibration import OdometryCalibration, calibrate_odometry
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.particle_smoother import ParticleSmootherSettings, PathSamples, sample_paths
 from fusion.pose_filter import PoseFilter, UpdateReport
 from fusion.pose_lattice import PoseLattice
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 
 __all__ = [
+    "FG2_KITTI_SAME_AREA",
+    "ORIENTERNET_KITTI_SEQUENTIAL",
+    "TRANSLOCNET_KITTI",
+    "CloudHistory",
+    "EmulatedLikelihood",
+    "EmulatorSettings",
+    "ErrorCorrelation",
+    "ErrorProfile",
     "Estimate",
     "GaussianLikelihood",
     "GaussianMixture",
@@ -32,6 +52,7 @@ __all__ = [
     "GridSmootherResult",
     "KalmanFilter",
     "KalmanFilterSettings",
+    "LikelihoodEmulator",
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
@@ -41,9 +62,13 @@ __all__ = [
     "OutlierMixture",
     "ParticleFilter",
     "ParticleFilterSettings",
+    "ParticleSmootherSettings",
+    "PathSamples",
     "PoseFilter",
     "PoseLattice",
     "PoseLikelihood",
+    "PublishedFigures",
+    "RecordedCloud",
     "SkyfixError",
     "SmootherResult",
     "SmootherSettings",
@@ -52,8 +77,10 @@ __all__ = [
     "UpdateReport",
     "accumulate",
     "calibrate_odometry",
+    "estimate_error_correlation",
     "find_modes",
     "increments_at",
+    "sample_paths",
     "smooth",
     "smooth_on_grid",
 ]

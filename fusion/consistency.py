@@ -1,6 +1,7 @@
-"""Is the stated uncertainty the real one? NEES and coverage, and the temperature for errors correlated in time.
+"""Is the stated uncertainty the real one? NEES, NIS and coverage, and the temperature for errors correlated in time.
 
-Source of NEES: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, 5.4.
+Source of NEES and NIS: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+section 5.4.
 """
 
 import numpy as np
@@ -71,6 +72,60 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:
         raise SkyfixError("covariances: expected positive definite, got one that is not") from error
     white = np.linalg.solve(root, errors[..., None])[..., 0]
     return (white**2).sum(axis=1)
+
+
+def nis(innovations: ArrayLike, predicted: ArrayLike, measured: ArrayLike) -> FloatArray:
+    """Normalised innovation squared, ``v^T (P + R)^-1 v`` (N,): NEES without ground truth.
+
+    Parameters
+    ----------
+    innovations : (N, D) array_like
+        Measurement minus prediction, angles wrapped; of a multimodal likelihood, its mode nearest to the prediction.
+    predicted : (N, D, D) array_like
+        Covariances P of the prediction, before the update.
+    measured : (N, D, D) array_like
+        Covariances R of the measurement, in the same frame.
+
+    Raises
+    ------
+    SkyfixError
+        When shapes disagree or a sum is not positive definite.
+    """
+    innovations = checked("innovations", innovations, ("N", "D"))
+    count, dof = innovations.shape
+    total = checked("predicted", predicted, (count, dof, dof)) + checked("measured", measured, (count, dof, dof))
+    return nees(innovations, total)
+
+
+def mean_nees_bounds(count: int, dof: int, level: float = 0.95, correlation: float = 0.0) -> tuple[float, float]:
+    """Interval that the mean of `count` NEES (or NIS) values falls in with probability `level` when all is right.
+
+    Divided by `dof`, these are the bounds of the average NEES per degree of freedom (ANEES).
+
+    Parameters
+    ----------
+    count : int
+        Number of values averaged.
+    dof : int
+        Dimensions of an error.
+    level : float
+        Probability, in (0, 1).
+    correlation : float
+        Of an error with the next one, in [0, 1); a filter's errors are correlated. Squares of a first-order
+        autoregression have the correlation ``rho^2``, so the values are worth ``n (1 - rho^2) / (1 + rho^2)``.
+
+    Raises
+    ------
+    SkyfixError
+        When an argument is out of range.
+    """
+    if count < 1 or dof < 1:
+        raise SkyfixError(f"NEES bounds: expected count >= 1 and dof >= 1, got {count} and {dof}")
+    if not (0.0 < level < 1.0 and 0.0 <= correlation < 1.0):
+        raise SkyfixError(f"NEES bounds: expected level in (0, 1), correlation in [0, 1), got {level}, {correlation}")
+    worth = count * (1.0 - correlation**2) / (1.0 + correlation**2)
+    low, high = chi2.ppf([0.5 - 0.5 * level, 0.5 + 0.5 * level], worth * dof) / worth
+    return float(low), float(high)
 
 
 def coverage(nees_values: ArrayLike, dof: int, level: float = 0.95) -> float:

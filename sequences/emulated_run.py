@@ -1,0 +1,211 @@
+"""A drive with real odometry and EMULATED measurements: what a tracker makes of a network with published errors.
+
+Odometry and ground truth are a sequence's own; in place of scans, a map and a network, likelihoods with a stated error
+profile are drawn about the ground truth (`fusion.likelihood_emulator`). So the rows say how well odometry and
+measurements of that quality are fused, and nothing about a network, a map, or the truth's own accuracy.
+
+Fairness: the start is drawn from the profile's box about the truth and is all that the filter knows of it; odometry,
+noise model and clock are those of any other run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from fusion import se2
+from fusion.arrays import FloatArray, IntArray
+from fusion.cloud_history import CloudHistory
+from fusion.consistency import MAX_TEMPERATURE, correlated_error_temperature
+from fusion.error_profile import TRANSLOCNET_KITTI, ErrorProfile
+from fusion.errors import SkyfixError
+from fusion.estimate import Estimate
+from fusion.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
+from fusion.odometry import OdometryNoise, increments_at
+from fusion.particle_filter import ParticleFilter
+from fusion.particle_smoother import ParticleSmootherSettings, sample_paths
+from fusion.prior import UniformPrior
+from fusion.trajectory import Trajectory
+from sequences.clock_offset import shifted
+from sequences.metrics import summarise
+from sequences.start import offset_in_box
+
+_START_STREAM, _PRIOR_STREAM, _FILTER_STREAM, _MEASURE_STREAM, _SMOOTHER_STREAM = range(5)
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatedRunSettings:
+    """What an emulated run depends on besides the drive.
+
+    Attributes
+    ----------
+    profile
+        The emulated network's errors.
+    emulator
+        How they repeat and how honest the likelihoods are.
+    seed
+        Of the start, the measurements, the particles and the paths.
+    particles, kept_particles
+        Of the filter, and at most kept of each cloud for the smoother.
+    measure_every_m
+        A measurement when the odometry has moved this far since the last one; 0 for every frame.
+    handled_length_m
+        Correlation length that the filter flattens likelihoods for: 0 takes errors for independent, None knows the
+        emulator's own. One found by `estimate_error_correlation` is what a user would have: errors with tails repeat
+        less than the Gaussians that they are drawn by.
+    odometry_clock_s
+        Moves the odometry's stamps, for an odometry whose clock is known to be off.
+    noise, smoother
+        The odometry's noise, and how paths are drawn.
+    """
+
+    profile: ErrorProfile = TRANSLOCNET_KITTI
+    emulator: EmulatorSettings = field(default_factory=EmulatorSettings)
+    seed: int = 0
+    particles: int = 2000
+    kept_particles: int = 2000
+    measure_every_m: float = 4.0
+    handled_length_m: float | None = None
+    odometry_clock_s: float = 0.0
+    noise: OdometryNoise = field(default_factory=OdometryNoise)
+    smoother: ParticleSmootherSettings = field(default_factory=lambda: ParticleSmootherSettings(paths=300))
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise SkyfixError(f"seed: expected 0 or more, got {self.seed}")
+        if self.particles < 1:
+            raise SkyfixError(f"particles: expected >= 1, got {self.particles}")
+        if not (np.isfinite(self.measure_every_m) and self.measure_every_m >= 0.0):
+            raise SkyfixError(f"measure_every_m: expected 0 or more, got {self.measure_every_m}")
+        if self.handled_length_m is not None and not (
+            np.isfinite(self.handled_length_m) and self.handled_length_m >= 0
+        ):
+            raise SkyfixError(f"handled_length_m: expected 0 or more, got {self.handled_length_m}")
+
+    def temperature(self, moved_m: float) -> float:
+        """By how much the filter flattens a likelihood so far after the last one."""
+        rho = self.emulator.step_correlation
+        if self.handled_length_m is not None:
+            return correlated_error_temperature(moved_m, self.handled_length_m)
+        if rho is not None:
+            return min((1.0 + rho) / (1.0 - rho), MAX_TEMPERATURE)
+        return correlated_error_temperature(moved_m, self.emulator.correlation_length_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EmulatedRun:
+    """Trajectories of an emulated run and their errors.
+
+    Attributes
+    ----------
+    name
+        Of the profile; it says 'emulated'.
+    filter, smoother
+        Estimates at all stamps, with covariances.
+    single_shot
+        The measurements' own answers.
+    measured
+        (K,) frames with a measurement.
+    metrics
+        `metrics.summarise` by method: prior, odometry, single_shot, filter, smoother.
+    """
+
+    name: str
+    filter: Trajectory
+    smoother: Trajectory
+    single_shot: Trajectory
+    measured: IntArray
+    metrics: dict[str, dict[str, Any]]
+
+    def table(self) -> str:
+        """The methods as a Markdown table, one line each, under a title that says what was emulated."""
+        lines = [
+            f"{self.name}: {len(self.measured)} emulated measurements",
+            "",
+            "| method | mean m | median m | max m | heading mean ° | NEES / 3 | 95 % ellipse |",
+            "|---|--:|--:|--:|--:|--:|--:|",
+        ]
+        for method, errors in self.metrics.items():
+            position, heading = errors["position_error_m"], errors["heading_error_deg"]
+            cells = [f"{position[key]:.2f}" for key in ("mean", "median", "max")] + [f"{heading['mean']:.2f}"]
+            known = "nees" in errors
+            cells += [f"{errors['nees']['mean'] / 3:.2f}", f"{100 * errors['ellipse95']:.0f} %"] if known else ["", ""]
+            lines.append("| " + " | ".join([method, *cells]) + " |")
+        return "\n".join(lines) + "\n"
+
+
+def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunSettings | None = None) -> EmulatedRun:
+    """Track a drive by its odometry and emulated measurements, then smooth it.
+
+    Parameters
+    ----------
+    truth
+        True poses in the map frame; the run has their stamps.
+    odometry
+        Drifting poses in a frame of its own, covering these stamps.
+    settings
+        Everything else.
+
+    Raises
+    ------
+    SkyfixError
+        If there are fewer than two poses or the odometry does not cover them.
+    """
+    settings = settings or EmulatedRunSettings()
+    stamps, poses, profile = truth.stamp_ns, truth.poses, settings.profile
+    if len(truth) < 2:
+        raise SkyfixError(f"truth: expected at least two poses, got {len(truth)}")
+    moved = shifted(odometry, settings.odometry_clock_s) if settings.odometry_clock_s else odometry
+    increments = increments_at(stamps, moved, settings.noise, tolerance_ns=1_000_000)
+    box = (profile.half_extent_m, profile.half_heading_rad)
+    start = poses[0] + offset_in_box(*box, np.random.default_rng([settings.seed, _START_STREAM]), 1)[0]
+    streams = {n: np.random.default_rng([settings.seed, n]) for n in (_FILTER_STREAM, _MEASURE_STREAM)}
+    prior = UniformPrior(start, *box)
+    particles = ParticleFilter.from_prior(prior, settings.particles, streams[_FILTER_STREAM])
+    emulator = LikelihoodEmulator(profile, streams[_MEASURE_STREAM], settings.emulator)
+    history = CloudHistory(settings.kept_particles, settings.seed)
+    estimates: list[Estimate] = []
+    answers: dict[int, FloatArray] = {}
+    since_m = np.inf
+    for frame, stamp in enumerate(stamps.tolist()):
+        if frame:
+            increment = increments[frame - 1]
+            particles.predict(increment)
+            history.move(increment)
+            since_m += float(np.hypot(*increment.delta[:2]))
+        if since_m >= settings.measure_every_m:
+            likelihood = emulator.measure(poses[frame], since_m)
+            particles.update(likelihood, settings.temperature(since_m) if answers else 1.0)
+            answers[frame], since_m = likelihood.answer, 0.0
+            history.record(particles, stamp)
+        elif frame == len(stamps) - 1:
+            history.record(particles, stamp)
+        estimates.append(particles.estimate(stamp))
+    smoothed = sample_paths(history, np.random.default_rng([settings.seed, _SMOOTHER_STREAM]), settings.smoother)
+    measured = np.array(list(answers), dtype=np.int64)
+    filtered = Trajectory(
+        stamps, np.array([one.pose for one in estimates]), np.array([one.covariance for one in estimates])
+    )
+    single_shot = Trajectory(stamps[measured], np.array(list(answers.values())))
+    offsets = offset_in_box(*box, np.random.default_rng([settings.seed, _PRIOR_STREAM]), len(truth))
+    placed = _placed(np.array([increment.delta for increment in increments]), start)
+    smoother = smoothed.trajectory()
+    metrics = {
+        "prior": summarise(poses, poses + offsets),
+        "odometry": summarise(poses, placed),
+        "single_shot": summarise(poses[measured], single_shot.poses),
+        "filter": summarise(poses, filtered.poses, filtered.covariances),
+        "smoother": summarise(poses, smoother.poses, smoother.covariances),
+    }
+    return EmulatedRun(profile.name, filtered, smoother, single_shot, measured, metrics)
+
+
+def _placed(deltas: FloatArray, start: FloatArray) -> FloatArray:
+    """Poses (N + 1, 3) of odometry alone, from a start (3,) and N motions (N, 3)."""
+    poses = np.empty((len(deltas) + 1, 3))
+    poses[0] = start
+    for step, delta in enumerate(deltas):
+        poses[step + 1] = se2.compose(poses[step], delta)
+    return poses

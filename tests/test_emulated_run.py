@@ -1,0 +1,85 @@
+"""Emulated runs: fusing beats every measurement and the odometry, on a made-up drive and on a real one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusion import (
+    ORIENTERNET_KITTI_SEQUENTIAL,
+    EmulatorSettings,
+    ParticleSmootherSettings,
+    SkyfixError,
+    Trajectory,
+    se2,
+)
+from sequences.emulated_odometry import emulate_odometry
+from sequences.emulated_run import EmulatedRunSettings, run_emulated
+from sequences.folder import FolderSequence
+
+QUICK = ParticleSmootherSettings(paths=100)
+
+
+def winding_drive(frames: int) -> Trajectory:
+    poses = [np.array([50.0, 20.0, 0.4])]
+    for frame in range(1, frames):
+        poses.append(se2.compose(poses[-1], np.array([1.0, 0.0, 0.04 * np.sin(0.02 * frame)])))
+    return Trajectory(np.arange(frames) * 100_000_000, np.array(poses))
+
+
+def test_fusing_emulated_measurements_beats_them_and_the_odometry() -> None:
+    truth = winding_drive(400)
+    settings = EmulatedRunSettings(particles=600, kept_particles=600, smoother=QUICK)
+    run = run_emulated(truth, emulate_odometry(truth, 1), settings)
+    mean = {name: row["position_error_m"]["mean"] for name, row in run.metrics.items()}
+    assert list(mean) == ["prior", "odometry", "single_shot", "filter", "smoother"]
+    assert 2.0 * mean["filter"] < min(mean["single_shot"], mean["odometry"], mean["prior"])
+    assert mean["smoother"] < mean["filter"]
+    assert len(run.measured) == pytest.approx(100, abs=3)
+    np.testing.assert_array_equal(run.smoother.stamp_ns, truth.stamp_ns)
+    assert run.table().startswith("emulated TransLocNet")
+    again = run_emulated(truth, emulate_odometry(truth, 1), settings)
+    np.testing.assert_array_equal(again.smoother.poses, run.smoother.poses)
+
+
+def test_settings_reach_the_run() -> None:
+    truth = winding_drive(60)
+    settings = EmulatedRunSettings(
+        ORIENTERNET_KITTI_SEQUENTIAL, particles=300, measure_every_m=0.0, smoother=QUICK, odometry_clock_s=0.1
+    )
+    run = run_emulated(truth, emulate_odometry(truth, 1), settings)
+    assert len(run.measured) == 60
+    assert "OrienterNet" in run.name
+    assert EmulatedRunSettings(emulator=EmulatorSettings(step_correlation=0.9)).temperature(4.0) == pytest.approx(19.0)
+    long = EmulatorSettings(correlation_length_m=4.0)
+    assert EmulatedRunSettings(emulator=long).temperature(4.0) == pytest.approx((1 + np.exp(-1)) / (1 - np.exp(-1)))
+    assert EmulatedRunSettings(emulator=long, handled_length_m=0.0).temperature(4.0) == 1.0
+    assert EmulatedRunSettings().temperature(4.0) == 1.0
+
+
+def test_bad_settings_are_refused() -> None:
+    for word, call in {
+        "seed": lambda: EmulatedRunSettings(seed=-1),
+        "particles": lambda: EmulatedRunSettings(particles=0),
+        "measure_every_m": lambda: EmulatedRunSettings(measure_every_m=np.nan),
+        "handled_length_m": lambda: EmulatedRunSettings(handled_length_m=-1.0),
+        "two poses": lambda: run_emulated(winding_drive(1), winding_drive(5)),
+    }.items():
+        with pytest.raises(SkyfixError, match=word):
+            call()
+
+
+def test_a_kilometre_of_real_odometry(shared_data: Callable[[str], Path]) -> None:
+    """KITTI 00's first 1200 frames, real stereo odometry, emulated TransLocNet every 4 m."""
+    sequence = FolderSequence(shared_data("kitti00"))
+    assert sequence.ground_truth is not None
+    truth = Trajectory(sequence.ground_truth.stamp_ns[:1200], sequence.ground_truth.poses[:1200])
+    settings = EmulatedRunSettings(particles=1000, kept_particles=1000, smoother=QUICK)
+    metrics = run_emulated(truth, sequence.odometry("sptam"), settings).metrics
+    assert metrics["single_shot"]["position_error_m"]["mean"] > 5.0
+    assert metrics["filter"]["position_error_m"]["mean"] < 2.5
+    assert metrics["smoother"]["position_error_m"]["mean"] < 1.4
+    assert 0.4 < metrics["smoother"]["nees"]["mean"] / 3 < 1.6
