@@ -78,5 +78,5 @@ def test_processes_share_out_every_batch_and_no_sample_twice() -> None:
     whole = truths(Processes())
     parts = [truths(Processes(rank, 2)) for rank in range(2)]
     assert [a + b for a, b in zip(*parts, strict=True)] == whole
-    with pytest.raises(SkyfixError, match="expected a multiple of the 3 processes, got 4"):
+    with pytest.raises(SkyfixError, match="expected a multiple of the 3 processes, got 2"):
         truths(Processes(0, 3))
