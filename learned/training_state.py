@@ -101,7 +101,7 @@ class TrainingState:
             content = torch.load(path, weights_only=True, map_location="cpu")
             made_with = content["settings"]
         except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
-            what = str(error).splitlines()[0]
+            what = next(iter(str(error).splitlines()), type(error).__name__)
             raise SkyfixError(f"training: {path} cannot be read, delete it to start afresh: {what}") from error
         if made_with != _fingerprint(self.settings):
             raise SkyfixError(f"training: {path.name} was made with other settings; choose another output folder")

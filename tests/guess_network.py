@@ -48,7 +48,7 @@ class GuessNet(nn.Module):
         self.autocast.append(torch.is_autocast_enabled("cpu"))
         position, heading = self.terms(batch)
         total = (position + heading).mean() * (1 + self.settings.dropout * torch.rand(()))
-        if float(self.log_sigma) >= self.settings.poison_at:
+        if float(self.log_sigma.detach()) >= self.settings.poison_at:
             total = total * float("nan")
         return {"total": total, "position": position.mean(), "heading": heading.mean()}
 
@@ -91,7 +91,7 @@ class GuessMatcher:
         x, y = grid.centres()
         squared = (x[None, :] - search.centre[0]) ** 2 + (y[:, None] - search.centre[1]) ** 2
         yaw = np.arange(YAW_BINS) * 2 * np.pi / YAW_BINS
-        sigma, kappa = math.exp(float(self.net.log_sigma)), math.exp(float(self.net.log_kappa))
+        sigma, kappa = math.exp(self.net.log_sigma.item()), math.exp(self.net.log_kappa.item())
         scores = -squared[:, :, None] / (2 * sigma**2) + kappa * np.cos(yaw - search.centre[2])
         return self.calibration.applied(LikelihoodVolume.from_scores(scores, grid))
 

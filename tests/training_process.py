@@ -32,8 +32,8 @@ KILLED = TrainingSettings(
     network=NetworkChoice("guess", GuessSettings(dropout=0.3)),
 )
 TOGETHER = TrainingSettings(
-    steps=4,
-    batch=4,
+    steps=3,
+    batch=2,
     warmup_steps=1,
     validate_every=1,
     workers=0,
