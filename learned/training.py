@@ -6,6 +6,7 @@ going on would have given.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -61,6 +62,7 @@ def train(
     processes: Processes = ALONE,
     tensorboard: bool = False,
     view: ValidationView | None = None,
+    initial: Mapping[str, Tensor] | None = None,
 ) -> LocalizationNet:
     """Train a network, resuming from OUT_DIR/state.pt where there is one.
 
@@ -81,6 +83,8 @@ def train(
         The processes that train together, see `learned.processes.joined_processes`.
     tensorboard
         Also write OUT_DIR/tensorboard.
+    initial
+        Weights to start from, in place of fresh ones.
 
     Raises
     ------
@@ -89,6 +93,8 @@ def train(
     """
     make_folder(out_dir)
     state = TrainingState(settings, settings.torch_device(processes.rank))
+    if initial is not None:
+        state.start_from(initial)
     state.resume(out_dir / STATE_FILE)
     log = TrainingLog(out_dir, state.step, tensorboard) if processes.is_first else None
     processes.wait()

@@ -8,6 +8,7 @@ import copy
 import io
 import os
 import pickle
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -44,6 +45,22 @@ class TrainingState:
     def evaluated(self) -> LocalizationNet:
         """The network that is validated and kept: the moving average where there is one."""
         return self.net if self.average is None else self.average
+
+    def start_from(self, weights: Mapping[str, Tensor]) -> None:
+        """Take the weights of a network of the same architecture in place of fresh ones.
+
+        Raises
+        ------
+        SkyfixError
+            If they do not fit.
+        """
+        try:
+            for net in (self.net, self.average):
+                if net is not None:
+                    net.load_state_dict(weights)
+        except RuntimeError as error:
+            what = str(error).splitlines()[-1].strip()
+            raise SkyfixError(f"training: the initial weights do not fit the network: {what}") from error
 
     def advance(self, total: Tensor) -> float:
         """One optimizer step down the gradient of a loss, clipped; returns the gradient's norm.

@@ -214,6 +214,13 @@ def train(
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Also write the losses as TensorBoard event files into OUT.")
     ] = False,
+    initial: Annotated[
+        Path | None,
+        typer.Option(
+            help="Start from the weights of this checkpoint, of the same architecture: fine-tuning.",
+            metavar="CHECKPOINT",
+        ),
+    ] = None,
 ) -> None:
     """Train a network on scans simulated in OpenStreetMap extracts; goes on where it was stopped.
 
@@ -221,7 +228,7 @@ def train(
     """
     from sequences.train_command import TrainOptions, train_from_config
 
-    options = TrainOptions(tuple(override or ()), minutes, cache, tensorboard)
+    options = TrainOptions(tuple(override or ()), minutes, cache, tensorboard, initial)
     checkpoint = train_from_config(config, data, out, _training_line, options)
     if os.environ.get("RANK", "0") == "0":  # of the processes that torchrun starts, the first speaks
         typer.echo(f"checkpoint: {checkpoint}")

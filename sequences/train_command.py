@@ -21,7 +21,7 @@ from fusion import se2
 from fusion.errors import SkyfixError
 from learned.bev import log_density
 from learned.calibration import RIGHT_WITHIN_M, Calibration, fit_calibration, match_samples, mean_nll, sample_map
-from learned.checkpoint import save_network
+from learned.checkpoint import load_network, save_network
 from learned.network import Architecture, LocalizationNet, on_cpu
 from learned.processes import Processes, joined_processes
 from learned.reliability import highest_density_level, region_coverage, reliability
@@ -55,12 +55,15 @@ class TrainOptions:
         Where samples are kept, also for other runs; None: in the output folder.
     tensorboard
         Also write event files.
+    initial
+        Checkpoint of the same architecture to start from; None: fresh weights.
     """
 
     overrides: Sequence[str] = ()
     minutes: float | None = None
     cache_dir: Path | None = None
     tensorboard: bool = False
+    initial: Path | None = None
 
 
 def find_extract(name: str, data_dir: Path) -> MapFeatures:
@@ -99,6 +102,10 @@ def train_from_config(
     """
     options = options or TrainOptions()
     config = read_config(config_path, options.overrides)
+    initial = None
+    if options.initial is not None:
+        initial = load_network(options.initial, config.training.network.architecture)[0].state_dict()
+        config = config.with_initial(options.initial)
     make_folder(out_dir)
     cache_dir = options.cache_dir or out_dir / "cache"
     with joined_processes() as processes:
@@ -118,11 +125,14 @@ def train_from_config(
             processes=processes,
             tensorboard=options.tensorboard,
             view=_validation_view(config, validation, out_dir / "validation"),
+            initial=initial,
         )
         path = out_dir / f"{config.training.network.name}.safetensors"
         if processes.is_first:
             far = SimulatedSamples(held_out, _calibration_settings(config), cache_dir / "calibration")
             command = " ".join(["skyfix train", config_path.name, *(f"--set {o}" for o in options.overrides)])
+            if options.initial is not None:
+                command += f" --initial {options.initial.name}"
             _finish(net, far, config, command, path)
         processes.wait()
     return path

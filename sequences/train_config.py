@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,11 +25,12 @@ class TrainConfig(BaseModel):
 
     Training sees scans to the reach of `training.network.bev`; afterwards the network is calibrated, and used, with
     scans to `matching_half_extent_m`, where its architecture allows another reach. Left out, that is 72 m, or the
-    network's own reach where it has but one.
+    network's own reach where it has but one. `initial` names the checkpoint that it started from, see `with_initial`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    initial: str | None = None
     extracts: dict[str, float]
     matching_half_extent_m: float | None = None
     validation_extract: str
@@ -62,6 +64,11 @@ class TrainConfig(BaseModel):
                 f"matching_half_extent_m: expected {bev.half_extent_m:g}, the one reach of {network.name}, "
                 f"got {self.matching_reach_m:g}"
             )
+
+    def with_initial(self, checkpoint: Path) -> TrainConfig:
+        """The same, saying by name and SHA-256 which checkpoint's weights training starts from."""
+        digest = hashlib.sha256(checkpoint.read_bytes()).hexdigest()
+        return self.model_copy(update={"initial": f"{checkpoint.name} sha256:{digest}"})
 
     def with_steps(self, steps: int) -> TrainConfig:
         """The same for another number of steps."""

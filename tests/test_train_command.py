@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
 import sequences.train_budget
 from fusion.errors import SkyfixError
@@ -60,6 +62,24 @@ def test_a_checkpoint_comes_out_calibrated_and_with_its_provenance(tiny: Path, t
     other = TrainOptions(("simulation.least_buildings=2",), cache_dir=tmp_path / "out" / "cache")
     with pytest.raises(SkyfixError, match="were made with least_buildings 5, these need 2; choose another folder"):
         train_from_config(tiny, tmp_path, tmp_path / "other", options=other)
+
+
+def test_training_goes_on_from_a_checkpoint(tiny: Path, tmp_path: Path) -> None:
+    """With steps of no length the weights are those that it started from; another network's are refused."""
+    first = train_from_config(tiny, tmp_path, tmp_path / "first")
+    cache = tmp_path / "first" / "cache"
+    options = TrainOptions(("training.learning_rate=1e-12", "training.seed=7"), cache_dir=cache, initial=first)
+    second = train_from_config(tiny, tmp_path, tmp_path / "second", options=options)
+    before, after = load_file(first), load_file(second)
+    assert all(torch.allclose(before[name], after[name], atol=1e-6) for name in before)
+    facts = json.loads(second.with_suffix(".json").read_text())
+    assert facts["command"].endswith("--initial rotmatch.safetensors")
+    assert facts["config"]["initial"].startswith("rotmatch.safetensors sha256:")
+    with pytest.raises(SkyfixError, match="holds a training with other settings, initial"):
+        train_from_config(tiny, tmp_path, tmp_path / "second", options=replace(options, initial=None))
+    wider = replace(options, overrides=("training.network.channels=6",))
+    with pytest.raises(SkyfixError, match="the initial weights do not fit the network"):
+        train_from_config(tiny, tmp_path, tmp_path / "third", options=wider)
 
 
 def test_minutes_become_steps_once(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
