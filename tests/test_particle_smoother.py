@@ -15,13 +15,10 @@ from fusion import (
     ParticleFilter,
     ParticleFilterSettings,
     ParticleSmootherSettings,
-    SkyfixError,
-    accumulate,
     sample_paths,
     se2,
 )
 from fusion.backward_kernel import step_back
-from fusion.odometry_bridge import bridge
 
 GRID = MapGrid(400, 400, 0.5, -100.0, -100.0)
 MEASURED = np.diag([0.6, 0.4, 0.03]) ** 2
@@ -257,50 +254,6 @@ def test_perfect_odometry_is_followed_down_to_the_floor():
     assert np.linalg.eigvalsh(sample_paths(history, 0).trajectory().covariances).min() > 0.0
 
 
-def test_bridges_are_the_conditional_of_the_odometry():
-    """Against importance sampling: free walks, weighted by how near they end; tolerances of five errors."""
-    steps = [
-        increment(1, [1.0, 0.0, 0.3], np.diag([0.1, 0.05, 0.05]) ** 2),
-        increment(2, [1.0, 0.1, 0.4], np.diag([0.2, 0.05, 0.02]) ** 2),
-        increment(3, [0.5, 0.0, -0.2], np.diag([0.1, 0.1, 0.05]) ** 2),
-    ]
-    total, start, rng = accumulate(steps), np.array([3.0, -2.0, 3.0]), np.random.default_rng(12)
-    end = se2.compose(start, total.delta + np.array([0.15, -0.1, 0.06]))
-    count = 400_000
-    pose, walk = np.repeat(start[None], count, axis=0), []
-    for step in steps:
-        pose = se2.compose(pose, step.delta + rng.multivariate_normal(np.zeros(3), step.covariance, count))
-        walk.append(pose)
-    miss = se2.between(end[None], pose)
-    weights = np.exp(-0.5 * (miss**2 / np.array([0.03, 0.03, 0.012]) ** 2).sum(axis=1))
-    effective = weights.sum() ** 2 / (weights**2).sum()
-    assert effective > 1000
-    drawn = bridge(np.repeat(start[None], 5000, axis=0), np.repeat(end[None], 5000, axis=0), steps, rng)
-    assert drawn.shape == (5000, 2, 3)
-    for k in range(2):
-        mean, covariance = se2.weighted_mean_and_covariance(walk[k], weights)
-        found, spread = se2.weighted_mean_and_covariance(drawn[:, k], np.ones(5000))
-        off = found - mean
-        off[2] = se2.wrap(off[2])
-        assert (np.abs(off) < 5 * np.sqrt(np.diag(covariance) / effective)).all()
-        ratio = np.sqrt(np.diag(spread) / np.diag(covariance))
-        np.testing.assert_allclose(ratio, 1.0, atol=5 / np.sqrt(2 * effective) + 0.05)
-
-
-def test_bridges_join_their_ends_under_any_odometry():
-    rng = np.random.default_rng(13)
-    steps = [increment(k, [1.0, 0.0, 0.2], np.diag([0.1, 0.03, 0.02]) ** 2 * (k % 2)) for k in range(6)]
-    start = rng.normal(0, [5, 5, 2], (50, 3))
-    end = se2.compose(start, accumulate(steps).delta + rng.normal(0, [0.3, 0.2, 0.05], (50, 3)))
-    drawn = bridge(start, end, steps, rng)
-    chain = np.concatenate([start[:, None], drawn, end[:, None]], axis=1)
-    moved = se2.between(chain[:, :-1], chain[:, 1:])
-    even = moved[:, [0, 2, 4]] - steps[0].delta  # the steps that claim to be perfect keep their word
-    np.testing.assert_allclose(even[:, :2], 0.0, atol=2e-4)
-    last = moved[:, 5] - steps[5].delta
-    assert (np.abs(last) < 6 * np.array([0.1, 0.1, 0.03])).all()
-
-
 def test_records_at_some_stamps_give_paths_at_all_of_them():
     """Updates at every third increment; with no measurement between, that is the same smoothing problem."""
     particles, every_third = (
@@ -329,20 +282,6 @@ def test_records_at_some_stamps_give_paths_at_all_of_them():
     assert only.stamp_ns.tolist() == [0, 3, 6, 9]
 
 
-def test_thinning_keeps_the_cloud_s_moments_and_its_bound():
-    history = CloudHistory(max_particles=400, seed=1)
-    rng = np.random.default_rng(16)
-    poses, log_weights = rng.normal(0, [2, 1, 0.1], (5000, 3)), rng.normal(0, 1, 5000)
-    history.record(Cloud(poses, log_weights), 0)
-    kept = history.clouds[0]
-    assert kept.particles.shape == (400, 3)
-    mean, covariance = se2.weighted_mean_and_covariance(poses, np.exp(log_weights))
-    found, spread = se2.weighted_mean_and_covariance(kept.particles, kept.weights)
-    sigma = np.sqrt(np.diag(covariance))
-    assert (np.abs(found - mean) < 4 * sigma / np.sqrt(400)).all()
-    np.testing.assert_allclose(np.sqrt(np.diag(spread)) / sigma, 1.0, atol=4 / np.sqrt(800))
-
-
 def test_same_seed_same_paths():
     history = recorded(measurements(5), 300, 17, max_particles=200)
     settings = ParticleSmootherSettings(50)
@@ -369,48 +308,3 @@ def test_one_record_is_its_own_smoothing():
     samples = sample_paths(history, 0)
     assert samples.paths.shape == (500, 1, 3)
     assert samples.stamp_ns.tolist() == [5]
-
-
-def test_bad_use_is_refused_in_one_line():
-    cloud = Cloud(np.zeros((5, 3)), np.zeros(5))
-
-    def after_one(call):
-        history = CloudHistory()
-        history.record(cloud, 10)
-        return call(history)
-
-    def moved_twice(history):
-        history.move(increment(12))
-        history.move(increment(12))
-
-    def recorded_late(history):
-        history.move(increment(12))
-        history.record(cloud, 13)
-
-    for word, call in {
-        "paths": lambda: ParticleSmootherSettings(paths=1),
-        "max_rejections": lambda: ParticleSmootherSettings(max_rejections=-1),
-        "floor_m": lambda: ParticleSmootherSettings(floor_m=0.0),
-        "floor_rad": lambda: ParticleSmootherSettings(floor_rad=np.nan),
-        "max_particles": lambda: CloudHistory(max_particles=0),
-        "recorded cloud": lambda: sample_paths(CloudHistory(), 0),
-        "before the first increment": lambda: CloudHistory().move(increment(1)),
-        "after 10 ns": lambda: after_one(lambda history: history.move(increment(10))),
-        "after 12 ns": lambda: after_one(moved_twice),
-        "last increment, 12 ns": lambda: after_one(recorded_late),
-        "last increment, 10 ns": lambda: after_one(lambda history: history.record(cloud, 11)),
-        "finite": lambda: CloudHistory().record(Cloud(np.full((5, 3), np.nan), np.zeros(5)), 0),
-        "at least one": lambda: CloudHistory().record(Cloud(np.zeros((0, 3)), np.zeros(0)), 0),
-        "log weights": lambda: CloudHistory().record(Cloud(np.zeros((5, 3)), np.zeros(4)), 0),
-    }.items():
-        with pytest.raises(SkyfixError, match=word) as caught:
-            call()
-        assert "\n" not in str(caught.value)
-
-
-def test_a_second_update_at_a_stamp_replaces_the_record():
-    history = CloudHistory()
-    history.record(Cloud(np.zeros((5, 3)), np.zeros(5)), 0)
-    history.record(Cloud(np.ones((7, 3)), np.zeros(7)), 0)
-    assert len(history) == 1
-    assert history.clouds[0].particles.shape == (7, 3)
