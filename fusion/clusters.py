@@ -15,8 +15,9 @@ from fusion import se2
 from fusion.arrays import FloatArray, IntArray
 from fusion.gaussian_mixture import GaussianMixture
 
-_CELL_M = 2.0
+CELL_M = 2.0
 _YAW_CELLS = 24  # 15 degrees each
+CELL_RAD = se2.TWO_PI / _YAW_CELLS
 _HALF_OF_THE_NEIGHBOURS = [offset for offset in product((-1, 0, 1), repeat=3) if offset > (0, 0, 0)]
 VARIANCE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])  # 1 mm and 0.1 mrad: keeps a collapsed cloud invertible
 
@@ -60,7 +61,7 @@ class Clusters:
 
 
 def _labels(poses: FloatArray) -> tuple[IntArray, int]:
-    plane = np.floor((poses[:, :2] - poses[:, :2].min(axis=0)) / _CELL_M).astype(np.int64) + 1
+    plane = np.floor((poses[:, :2] - poses[:, :2].min(axis=0)) / CELL_M).astype(np.int64) + 1
     stride = int(plane[:, 1].max()) + 2  # an empty column on either side: no neighbour is found across it
     turns = poses[:, 2] / se2.TWO_PI
     yaw = np.minimum(((turns - np.floor(turns)) * _YAW_CELLS).astype(np.int64), _YAW_CELLS - 1)

@@ -15,7 +15,9 @@ from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.interpolation import corners
+from fusion.kernels_likelihood import log_mass_of_maps
 from fusion.likelihood import DEFAULT_FLOOR, LikelihoodVolume, OutlierMixture, checked_temperature
+from fusion.lookup import MOST_CELLS, Lookup
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +64,25 @@ class LocationOrientationMaps:
             raise SkyfixError(f"confidence: expected in [0, 1], got {self.confidence}")
         object.__setattr__(self, "location", read_only(location))
         object.__setattr__(self, "orientation", read_only(orientation))
+
+    @property
+    def searched_volume(self) -> float:
+        """The crop times all headings, m^2 rad."""
+        return self.grid.area_m2 * se2.TWO_PI
+
+    def lookup(self, temperature: float) -> Lookup | None:
+        """What the compiled filter step reads: these arrays, and the constants of :meth:`tempered`."""
+        bins, pixels = self.orientation.shape[0], self.location.size
+        if self.orientation.size > MOST_CELLS:
+            return None
+        scale, shift = 1.0 / checked_temperature(temperature), 0.0
+        location = self.location.reshape(-1)
+        if scale != 1.0:
+            mass = log_mass_of_maps(location, self.orientation.reshape(bins, pixels), np.float32(scale))
+            shift = -(mass + float(np.log(self.grid.metres_per_pixel**2 * se2.TWO_PI / bins)))
+        slots = np.arange(pixels, dtype=np.int32)
+        table, floor = self.orientation.reshape(-1), self.floor
+        return Lookup(table, self.grid, bins, scale, shift, floor, floor, location, slots, 1, pixels)
 
     def to_volume(self) -> LikelihoodVolume:
         """The joint density as one array of cells."""
