@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from fusion.arrays import Float32Array, FloatArray
 from fusion.clusters import VARIANCE_FLOOR
-from fusion.kernels_resample import block_masses, spread_blocks
+from fusion.kernels_resample import block_masses, share_out, spread_blocks
 from fusion.kernels_step import (
     BLOCK,
     CENTRE,
     DELTA,
     KERNEL_ON,
     KERNEL_ROOT,
-    LARGEST,
     LOG_SHIFT,
     LOOKUP_SIZE,
     MOTION_SIZE,
@@ -38,14 +37,14 @@ from fusion.kernels_step import (
     combined,
     step_blocks,
 )
-from fusion.lookup import Lookup
+from fusion.lookup import NO_SLOTS, NO_TABLE, Lookup
 
 _REACH_M = 64.0  # the anchor follows the cloud when its mean is farther away
 _NOBODY = np.zeros(0, np.int32)
 _STAY = np.zeros(0)
-_NO_TABLE = np.zeros(0, np.float32)
 _NO_SHAPE = np.zeros(5, np.int64)
 _EQUAL = np.zeros(0)
+_ROUNDING = 1e-14
 
 
 @cache
@@ -55,15 +54,14 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 def lower_root(covariance: list[list[float]]) -> list[float]:
     """Lower triangular L, row by row (9,), with ``L L^T = covariance``; positive semidefinite will do."""
-    rows = [[0.0] * 3 for _ in range(3)]
-    for i in range(3):
-        for j in range(i + 1):
-            rest = covariance[i][j] - sum(rows[i][k] * rows[j][k] for k in range(j))
-            if i == j:
-                rows[i][i] = sqrt(rest) if rest > 1e-14 * covariance[i][i] else 0.0
-            elif rows[j][j] > 0.0:
-                rows[i][j] = rest / rows[j][j]
-    return [*rows[0], *rows[1], *rows[2]]
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance
+    a = sqrt(xx) if xx > 0.0 else 0.0
+    b, c = (xy / a, xt / a) if a > 0.0 else (0.0, 0.0)
+    rest = yy - b * b
+    d = sqrt(rest) if rest > _ROUNDING * yy else 0.0
+    e = (yt - b * c) / d if d > 0.0 else 0.0
+    rest = tt - c * c - e * e
+    return [a, 0.0, 0.0, b, d, 0.0, c, e, sqrt(rest) if rest > _ROUNDING * tt else 0.0]
 
 
 def positive_definite(covariance: list[list[float]], factor: float) -> FloatArray:
@@ -203,12 +201,10 @@ class Cloud:
         if len(self._log_weights) == 0:
             self._log_weights = np.zeros(self._count)
         blocks = len(self._sums)
-        masses, edges = np.empty(blocks), np.zeros(blocks + 1)
-        largest = self._sums[:, LARGEST]
-        self._share(block_masses, blocks, self._log_weights, self._sums, masses)
-        np.cumsum(masses * np.exp(largest - largest.max()), out=edges[1:])
-        edges *= count / edges[-1]
+        masses, edges = np.empty(blocks), np.empty(blocks + 1)
         ancestors = self._buffer("ancestors", count, np.int32)
+        self._share(block_masses, blocks, self._log_weights, self._sums, masses)
+        share_out(self._sums, masses, count, edges)
         self._share(spread_blocks, blocks, self._log_weights, self._sums, masses, edges, offset, ancestors)
         self.keep(ancestors)
 
@@ -293,7 +289,7 @@ class Cloud:
         if len(self._sums) != blocks:
             self._sums = np.zeros((blocks, SUMS))
         weigh = (
-            (NOTHING, _NO_TABLE, _NO_TABLE, _NOBODY, _NO_SHAPE)
+            (NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS, _NO_SHAPE)
             if lookup is None
             else (lookup.mode, lookup.table, lookup.location, lookup.slots, lookup.shape())
         )

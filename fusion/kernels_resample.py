@@ -31,6 +31,20 @@ def block_masses(
 
 
 @numba.njit(**KERNEL)
+def share_out(sums: NDArray[np.float64], masses: NDArray[np.float64], count: int, edges: NDArray[np.float64]) -> None:
+    """The weight before each block (blocks + 1,), in new particles: from 0 to `count`."""
+    largest = sums[0, LARGEST]
+    for block in range(len(masses)):
+        largest = max(largest, sums[block, LARGEST])
+    edges[0] = 0.0
+    for block in range(len(masses)):
+        edges[block + 1] = edges[block] + masses[block] * np.exp(sums[block, LARGEST] - largest)
+    scale = count / edges[len(masses)]
+    for block in range(len(masses) + 1):
+        edges[block] *= scale
+
+
+@numba.njit(**KERNEL)
 def _weights(
     start: int, n: int, log_weights: NDArray[np.float64], largest: float, weights: NDArray[np.float32]
 ) -> None:

@@ -102,7 +102,7 @@ class LikelihoodVolume:
         if log_prob.ndim != 3 or log_prob.shape[:2] != expected or log_prob.shape[2] < 1:
             raise SkyfixError(f"likelihood: expected ({expected[0]}, {expected[1]}, K), got {log_prob.shape}")
         floor = np.float32(self.floor)
-        peaks, evaluated, bad = survey(log_prob.reshape(-1, log_prob.shape[2]), floor)
+        peaks, evaluated, bad = survey(read_only(log_prob).reshape(-1, log_prob.shape[2]), floor)
         if bad or not np.isfinite(floor):
             raise SkyfixError("likelihood: expected finite log densities and floor, got NaN or an infinity")
         floor = float(floor)

@@ -9,20 +9,19 @@ the crop times all headings. So a lookup is the likelihood's own array and the t
 """
 
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion import se2
-from fusion.arrays import Float32Array, FloatArray
+from fusion.arrays import Float32Array, FloatArray, read_only
 from fusion.grid import MapGrid
 from fusion.kernels_step import LOOKUP_SIZE, MAPS, VOLUME
 
 MOST_CELLS = 2**31 - 1
 """Cells are counted in 32 bits."""
-_NO_LOCATION = np.zeros(0, np.float32)
-_NO_SLOTS = np.zeros(0, np.int32)
+NO_TABLE = read_only(np.zeros(0, np.float32))
+NO_SLOTS = read_only(np.zeros(0, np.int32))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,10 +55,15 @@ class Lookup:
     shift: float
     floor_before: float
     floor: float
-    location: Float32Array = field(default_factory=lambda: _NO_LOCATION)
-    slots: NDArray[np.int32] = field(default_factory=lambda: _NO_SLOTS)
+    location: Float32Array = field(default_factory=lambda: NO_TABLE)
+    slots: NDArray[np.int32] = field(default_factory=lambda: NO_SLOTS)
     pixel_stride: int = 0
     bin_stride: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("table", "location", "slots"):  # one kind of array, or the step is compiled once more
+            if getattr(self, name).flags.writeable:
+                object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
     def mode(self) -> int:
@@ -83,10 +87,7 @@ class Lookup:
         return arguments
 
 
-@runtime_checkable
-class HasLookup(Protocol):
-    """A likelihood that the compiled step can read; others are asked for the density of every particle."""
-
-    def lookup(self, temperature: float) -> Lookup | None:
-        """The likelihood to the power 1 / temperature, normalised; None when there are too many cells."""
-        ...
+def lookup_of(likelihood: object, temperature: float) -> Lookup | None:
+    """What the compiled step reads of a likelihood with a method ``lookup(temperature)``; None when it has none."""
+    found = getattr(likelihood, "lookup", None)
+    return None if found is None else found(temperature)

@@ -22,7 +22,7 @@ from fusion.clusters import find_clusters
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.likelihood import OutlierMixture, PoseLikelihood, checked_temperature
-from fusion.lookup import HasLookup
+from fusion.lookup import lookup_of
 from fusion.lost import LostModel, log_uniform_evidence, probability
 from fusion.odometry import OdometryIncrement
 from fusion.particle_filter_settings import ParticleFilterSettings
@@ -156,10 +156,9 @@ class ParticleFilter:
         """Weigh the cloud, in one pass when the likelihood can be looked up, and give the log evidence."""
         checked_temperature(temperature)
         mixture = likelihood.with_outliers(self.settings.outlier_probability)
-        if isinstance(mixture, OutlierMixture) and isinstance(mixture.likelihood, HasLookup):
-            lookup = mixture.likelihood.lookup(temperature)
-            if lookup is not None:
-                return self._cloud.weigh(lookup, mixture.probability)
+        lookup = lookup_of(mixture.likelihood, temperature) if isinstance(mixture, OutlierMixture) else None
+        if isinstance(mixture, OutlierMixture) and lookup is not None:
+            return self._cloud.weigh(lookup, mixture.probability)
         measurement = likelihood.tempered(temperature).with_outliers(self.settings.outlier_probability)
         log_likelihood = np.asarray(measurement.log_density(self._cloud.poses()), dtype=np.float64)
         if log_likelihood.shape != (len(self._cloud),) or not np.isfinite(log_likelihood).all():
