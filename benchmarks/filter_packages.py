@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -29,7 +30,7 @@ def package_candidates(particles: FloatArray, lookup: Lookup) -> Iterator[Candid
     makers = {"particles": particles_filter, "stonesoup": stonesoup_filter}
     for name in PACKAGES:
         if find_spec(name) is not None:
-            yield Candidate(f"{name} (PyPI)", lambda make=makers[name]: make(particles, lookup))  # type: ignore[misc]
+            yield Candidate(f"{name} (PyPI)", partial(makers[name], particles, lookup))
 
 
 def particles_filter(cloud: FloatArray, lookup: Lookup) -> Callable[[], Estimated]:
@@ -38,7 +39,7 @@ def particles_filter(cloud: FloatArray, lookup: Lookup) -> Callable[[], Estimate
 
     rng = np.random.default_rng(SEED)
 
-    class Drive(FeynmanKac):  # type: ignore[misc]
+    class Drive(FeynmanKac):
         def M0(self, N: int) -> FloatArray:
             return cloud.copy()
 
@@ -75,7 +76,7 @@ def stonesoup_filter(cloud: FloatArray, lookup: Lookup) -> Callable[[], Estimate
     def poses_of(state: Any) -> FloatArray:
         return np.ascontiguousarray(np.asarray(state.state_vector, dtype=np.float64).T)
 
-    class Motion(TransitionModel):  # type: ignore[misc]
+    class Motion(TransitionModel):
         ndim_state = 3
 
         def function(self, state: Any, noise: bool = True, **kwargs: Any) -> Any:
@@ -87,7 +88,7 @@ def stonesoup_filter(cloud: FloatArray, lookup: Lookup) -> Callable[[], Estimate
         def pdf(self, *args: Any, **kwargs: Any) -> float:
             return 1.0
 
-    class Volume(MeasurementModel):  # type: ignore[misc]
+    class Volume(MeasurementModel):
         ndim_state, ndim_meas, mapping = 3, 3, (0, 1, 2)
 
         def function(self, state: Any, noise: bool = False, **kwargs: Any) -> Any:

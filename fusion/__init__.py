@@ -9,6 +9,7 @@ from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
+from fusion.kld_sampling import KldSampling
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
@@ -22,6 +23,7 @@ __all__ = [
     "Estimate",
     "GaussianLikelihood",
     "GaussianMixture",
+    "KldSampling",
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",

@@ -61,6 +61,10 @@ class GaussianLikelihood:
         poses[:, 2] = se2.wrap(poses[:, 2])
         return poses
 
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """The Gaussian's own ln density (N,) at poses (N, 3), without a floor."""
+        return self.modes(1).log_density(poses)
+
     def modes(self, k: int) -> GaussianMixture:
         """The Gaussian itself."""
         if k < 1:

@@ -24,7 +24,7 @@ def cells_of(
 
 @numba.njit(**_OPTIONS)
 def components(cells: NDArray[np.int64], size: int, cols: int, yaw_cells: int) -> tuple[NDArray[np.int64], int]:
-    """Label (N,) of each occupied cell in a grid of `size` cells, corners and the seam of headings joined; and how many."""
+    """Label (N,) of each occupied cell in a grid of `size` cells, corners and the seam joined; and how many."""
     label_of = np.full(size, -1, np.int32)
     for cell in cells:
         label_of[cell] = -2  # occupied, not yet reached

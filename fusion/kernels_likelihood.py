@@ -11,11 +11,11 @@ _NOT_FINITE = np.int32(0x7F800000)
 
 
 @numba.njit(**KERNEL)
-def survey(values: NDArray[np.float32], floor: np.float32) -> tuple[NDArray[np.float32], int, int]:
+def survey(values: NDArray[np.float32], floor: np.float32) -> tuple[NDArray[np.float32], np.int64, np.int64]:
     """Of log densities (cells, K): the largest of every column, the number above the floor, the number not finite."""
     cells, bins = values.shape
     peaks = np.full(bins, F(-3.4e38))
-    evaluated, bad = 0, 0
+    evaluated, bad = np.int64(0), np.int64(0)
     for i in range(cells):
         above, odd = np.int32(0), np.int32(0)
         row = values[i]
@@ -24,13 +24,15 @@ def survey(values: NDArray[np.float32], floor: np.float32) -> tuple[NDArray[np.f
             peaks[k] = larger(value, peaks[k])
             above += np.int32(1) if value > floor else np.int32(0)
             odd += np.int32(1) if np.int32(bits_of(value) & _NOT_FINITE) == _NOT_FINITE else np.int32(0)
-        evaluated += above
-        bad += odd
+        evaluated += np.int64(above)
+        bad += np.int64(odd)
     return peaks, evaluated, bad
 
 
 @numba.njit(**KERNEL)
-def tempered_mass(values: NDArray[np.float32], floor: np.float32, peak: np.float32, share: np.float32) -> tuple[float, F]:
+def tempered_mass(
+    values: NDArray[np.float32], floor: np.float32, peak: np.float32, share: np.float32
+) -> tuple[float, F]:
     """Sum of ``exp((value - peak) * share)`` over the values (n,) above the floor, and the least of these."""
     mass, least = 0.0, F(3e38)
     for start in range(0, len(values), _RUN):

@@ -13,13 +13,15 @@ from typing import Any
 import numba
 import numpy as np
 from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
+from numba import extending, types
 
 INLINED: dict[str, Any] = {"fastmath": True, "forceinline": True, "nogil": True, "error_model": "numpy"}
 """Options of functions that are to disappear into the loop that calls them."""
 KERNEL: dict[str, Any] = {"fastmath": True, "nogil": True, "error_model": "numpy", "cache": True}
 """Options of functions that Python calls, or a loop over blocks."""
+
+intrinsic: Any = extending.intrinsic
+"""As untyped as what it makes: a function of the compiled side, whose first argument the caller does not give."""
 
 F = np.float32
 LEAST_EXPONENT, GREATEST_EXPONENT = F(-87.0), F(88.0)

@@ -13,9 +13,8 @@ from typing import Any
 import numba
 import numpy as np
 from numba import types
-from numba.extending import intrinsic
 
-from fusion.kernels_math import INLINED, F, float_of, bits_of, half_circle, log
+from fusion.kernels_math import INLINED, F, bits_of, float_of, half_circle, intrinsic, log
 
 U = np.uint32
 _PARITY = U(0x1BD11BDA)

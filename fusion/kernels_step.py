@@ -135,10 +135,10 @@ def _cell(position: F, count: np.int32) -> tuple[np.int32, np.int32, F]:
     """Lower cell, step to the upper one and weight of the upper one, of a position in cells from the edge."""
     last = F(count) - F(1.0)
     inner = larger(position - F(0.5), F(0.0))
-    inner = inner if inner < last else last
+    inner = min(last, inner)
     highest = np.int32(count - 2) if count > 2 else np.int32(0)
     lower = np.int32(inner)
-    lower = lower if lower < highest else highest
+    lower = min(highest, lower)
     return lower, np.int32(1) if count > 1 else np.int32(0), inner - F(lower)
 
 
@@ -196,7 +196,7 @@ def _weigh_by_volume(n: int, table: Float32s, shape: NDArray[np.int64], look: Fl
 
 @numba.njit(**INLINED)
 def _pixel_level(
-    pixel: np.int32, lower: np.int32, upper: np.int32, kw: F, table: Float32s, location: Float32s, terms: F
+    pixel: np.int32, lower: np.int32, upper: np.int32, kw: F, table: Float32s, location: Float32s, terms: tuple[F, F, F]
 ) -> F:
     """ln density at a pixel between two headings of it."""
     scale, shift, floor = terms

@@ -45,6 +45,10 @@ class PoseLikelihood(Protocol):
         """Draw poses (n, 3) from the density."""
         ...
 
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """ln density (N,) at poses (N, 3) of what `sample` draws from: `log_density` up to interpolation."""
+        ...
+
     def modes(self, k: int) -> GaussianMixture:
         """The at most `k` highest modes."""
         ...
@@ -204,6 +208,16 @@ class LikelihoodVolume:
         yaw = se2.wrap((yaw_bin + jitter[:, 2] - 0.5) * se2.TWO_PI / bin_count)
         return np.column_stack([xy, yaw])
 
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """The log density (N,) of the cell that each pose (N, 3) lies in; the floor outside the crop."""
+        poses = checked("poses", poses, ("N", 3))
+        bins = self.log_prob.shape[2]
+        yaw_bin = np.rint(poses[:, 2] * (bins / se2.TWO_PI)).astype(np.int64) % bins
+        inside = self.grid.contains(poses[:, :2])
+        row, col = np.where(inside, self.grid.pixel_from_xy(poses[:, :2]).T, 0.0).astype(np.int64)
+        row, col = np.minimum(row, self.grid.rows - 1), np.minimum(col, self.grid.cols - 1)
+        return np.where(inside, self.log_prob[row, col, yaw_bin].astype(np.float64), self.floor)
+
     def modes(self, k: int) -> GaussianMixture:
         """The at most `k` highest modes, as Gaussians with the moments of the mass around them."""
         return find_modes(self, k)
@@ -293,6 +307,15 @@ class OutlierMixture:
         xy = self.grid.xy_from_pixel(unit[:, :2] * (self.grid.rows, self.grid.cols))
         uniform = np.column_stack([xy, se2.wrap(unit[:, 2] * se2.TWO_PI)])
         return np.where(outlier[:, None], uniform, poses)
+
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """That of the likelihood, and outliers inside the crop only."""
+        poses = checked("poses", poses, ("N", 3))
+        inner = self.likelihood.draw_log_density(poses)
+        if self.probability == 0.0:
+            return inner
+        uniform = np.where(self.grid.contains(poses[:, :2]), np.log(self.probability), DEFAULT_FLOOR)
+        return np.logaddexp(np.log1p(-self.probability) + inner, uniform + log_uniform_density(self.grid))
 
     def modes(self, k: int) -> GaussianMixture:
         """The modes of the likelihood, their weights times 1 - p."""

@@ -112,6 +112,17 @@ class LocationOrientationMaps:
         xy = self.grid.xy_from_pixel(np.stack([row, col], axis=-1) + jitter[:, :2])
         return np.column_stack([xy, se2.wrap((yaw_bin + jitter[:, 2] - 0.5) * se2.TWO_PI / bin_count)])
 
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """The log density (N,) of the cell that each pose (N, 3) lies in; the floor outside the crop."""
+        poses = checked("poses", poses, ("N", 3))
+        bins = self.orientation.shape[0]
+        yaw_bin = np.rint(poses[:, 2] * (bins / se2.TWO_PI)).astype(np.int64) % bins
+        inside = self.grid.contains(poses[:, :2])
+        row, col = np.where(inside, self.grid.pixel_from_xy(poses[:, :2]).T, 0.0).astype(np.int64)
+        row, col = np.minimum(row, self.grid.rows - 1), np.minimum(col, self.grid.cols - 1)
+        joint = self.location[row, col].astype(np.float64) + self.orientation[yaw_bin, row, col]
+        return np.where(inside, joint, self.floor)
+
     def modes(self, k: int) -> GaussianMixture:
         """The at most `k` highest modes of the joint density."""
         return self.to_volume().modes(k)

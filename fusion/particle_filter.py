@@ -10,6 +10,7 @@ follows moves, weighs and sums. Estimates are of the weighted cloud, before resa
 Sources: Gordon, Salmond, Smith 1993; Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, 8.3.5 (augmented MCL).
 """
 
+from math import hypot, inf
 from typing import Self
 
 import numpy as np
@@ -21,9 +22,13 @@ from fusion.cloud import Cloud, positive_definite
 from fusion.clusters import find_clusters
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
+from fusion.grid import MapGrid
+from fusion.guided_proposal import guided
+from fusion.lattice_density import LatticeDensity
 from fusion.likelihood import OutlierMixture, PoseLikelihood, checked_temperature
 from fusion.lookup import lookup_of
 from fusion.lost import LostModel, log_uniform_evidence, probability
+from fusion.map_start import stratified_poses
 from fusion.odometry import OdometryIncrement
 from fusion.particle_filter_settings import ParticleFilterSettings
 from fusion.pose_filter import UpdateReport
@@ -72,6 +77,7 @@ class ParticleFilter:
         self._cloud = Cloud(cloud, None if log_weights is None else weights, key, self.settings.threads)
         self._lost_model = LostModel(self.settings.kidnap_probability, self.settings.recovery_probability)
         self._log_evidence = 0.0
+        self._travelled_m = self._turned_rad = inf  # since the last measurement that counted: the first one does
         self._lost = self.settings.kidnap_probability
 
     @classmethod
@@ -85,6 +91,19 @@ class ParticleFilter:
         """A filter with `count` particles drawn from a prior."""
         rng = np.random.default_rng(seed)
         return cls(prior.sample(count, rng), rng, settings)
+
+    @classmethod
+    def from_map(
+        cls,
+        grid: MapGrid,
+        count: int,
+        seed: int | np.random.Generator,
+        settings: ParticleFilterSettings | None = None,
+        allowed: ArrayLike | None = None,
+    ) -> Self:
+        """A filter that knows nothing: `count` particles all over a map, stratified, see `fusion.map_start`."""
+        rng = np.random.default_rng(seed)
+        return cls(stratified_poses(grid, count, rng, allowed), rng, settings)
 
     @property
     def particles(self) -> FloatArray:
@@ -103,7 +122,10 @@ class ParticleFilter:
 
     def predict(self, increment: OdometryIncrement) -> None:
         """Move every particle by the increment plus noise of its covariance."""
-        self._cloud.move(increment.delta.tolist(), increment.covariance.tolist())
+        delta = increment.delta.tolist()
+        self._cloud.move(delta, increment.covariance.tolist())
+        self._travelled_m += hypot(delta[0], delta[1])
+        self._turned_rad += abs(delta[2])
 
     def update(self, likelihood: PoseLikelihood, temperature: float = 1.0) -> UpdateReport:
         """Weight the particles by a likelihood; resample and recover when needed.
@@ -121,15 +143,19 @@ class ParticleFilter:
             When the likelihood gives NaN or an infinity; the filter is then as it was before.
         """
         settings = self.settings
+        if self._travelled_m < settings.standstill_m and self._turned_rad < settings.standstill_rad:
+            size = self._cloud.moments().effective_sample_size
+            return UpdateReport(self._log_evidence, size, lost_score=self._lost, used=False)
         log_uniform = log_uniform_evidence(likelihood, settings.outlier_probability)
         self._log_evidence = log_evidence = self._weigh(likelihood, temperature)
+        self._travelled_m = self._turned_rad = 0.0
         log_odds = self._lost_model.log_odds(self._lost, log_evidence, log_uniform)
         self._lost = probability(log_odds)
-        count = len(self._cloud)
+        size = self._cloud.moments().effective_sample_size
+        is_degenerate = size < settings.ess_fraction * len(self._cloud) or settings.adaptive is not None
+        count = self._next_count()
         is_collapsed = log_odds > settings.collapse_log_evidence_margin
         injected = min(round(settings.injection_share * count), count - 1) if is_collapsed else 0
-        size = self._cloud.moments().effective_sample_size
-        is_degenerate = size < settings.ess_fraction * count
         if injected or is_degenerate:
             self._resample(count - injected)
         if injected:
@@ -152,9 +178,17 @@ class ParticleFilter:
         covariance = positive_definite(moments.covariance, size / (size - 1.0) if size > 2.0 else 2.0)
         return Estimate(stamp_ns, pose, covariance, modes, size, self._log_evidence, self._lost)
 
+    def most_likely_pose(self) -> FloatArray:
+        """The particle (3,) where the cloud is densest, by a kernel estimate: a mode; the mean may lie between two."""
+        poses = self._cloud.poses()
+        density = LatticeDensity.of(poses, self._cloud.log_weights()).log_density(poses)
+        return poses[int(np.argmax(density))]
+
     def _weigh(self, likelihood: PoseLikelihood, temperature: float) -> float:
         """Weigh the cloud, in one pass when the likelihood can be looked up, and give the log evidence."""
         checked_temperature(temperature)
+        if self.settings.guided_share > 0.0:
+            return self._weigh_guided(likelihood.tempered(temperature).with_outliers(self.settings.outlier_probability))
         mixture = likelihood.with_outliers(self.settings.outlier_probability)
         lookup = lookup_of(mixture.likelihood, temperature) if isinstance(mixture, OutlierMixture) else None
         if isinstance(mixture, OutlierMixture) and lookup is not None:
@@ -164,6 +198,23 @@ class ParticleFilter:
         if log_likelihood.shape != (len(self._cloud),) or not np.isfinite(log_likelihood).all():
             raise SkyfixError(f"likelihood: expected {len(self._cloud)} finite log densities, got others")
         return self._cloud.add_log_likelihood(log_likelihood)
+
+    def _weigh_guided(self, measurement: PoseLikelihood) -> float:
+        """Replace the prediction by draws from it and from the measurement, weighed; the log evidence."""
+        predicted = LatticeDensity.of(self._cloud.poses(), self._cloud.log_weights())
+        count = len(self._cloud)
+        poses, log_weights = guided(predicted, measurement, count, self.settings.guided_share, self._rng)
+        if not np.isfinite(log_weights).all():
+            raise SkyfixError(f"likelihood: expected {count} finite log densities, got others")
+        self._cloud.replace(poses, log_weights)
+        largest = log_weights.max()
+        return float(largest + np.log(np.exp(log_weights - largest).mean()))
+
+    def _next_count(self) -> int:
+        """How many particles the cloud is to have after this measurement."""
+        if self.settings.adaptive is None:
+            return len(self._cloud)
+        return self.settings.adaptive.count(self._cloud.poses(), np.exp(self._cloud.log_weights()), self._rng)
 
     def _resample(self, count: int) -> None:
         """Replace the cloud by `count` equally weighted particles."""

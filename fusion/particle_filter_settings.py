@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from math import isfinite
 
 from fusion.errors import SkyfixError
+from fusion.kld_sampling import KldSampling
 from fusion.lost import LostModel
 from fusion.resampling import RESAMPLERS
 
@@ -30,6 +31,16 @@ class ParticleFilterSettings:
         Inject particles when being lost is ahead of being on track by this many nats.
     injection_share : float
         Share of the particles that is injected then, in [0, 1); 0 switches recovery off.
+    guided_share : float
+        Share of the particles drawn from each measurement instead of the prediction, in [0, 1); see
+        `fusion.guided_proposal`. For measurements much sharper than the prediction; costs far more than a plain step.
+    adaptive : KldSampling or None
+        Choose the number of particles anew at every measurement, which then always resamples.
+    standstill_m, standstill_rad : float
+        A measurement after less motion than both since the last one that counted is left out, and nothing is
+        resampled; 0 and 0 take every one. With errors that are correlated over a length L a measurement d later is
+        worth tanh(d / 2 L) of an independent one (`correlated_error_temperature`), so d = L / 25 leaves out what is
+        worth less than 2 %: standing still adds no information and only wears a cloud out.
     threads : int
         Threads that share the work on large clouds, at least 1; the result does not depend on it.
 
@@ -47,6 +58,10 @@ class ParticleFilterSettings:
     recovery_probability: float = 0.1
     collapse_log_evidence_margin: float = 1.0
     injection_share: float = 0.25
+    guided_share: float = 0.0
+    adaptive: KldSampling | None = None
+    standstill_m: float = 0.0
+    standstill_rad: float = 0.0
     threads: int = 1
 
     def __post_init__(self) -> None:
@@ -60,8 +75,12 @@ class ParticleFilterSettings:
         LostModel(self.kidnap_probability, self.recovery_probability)  # checks both
         if self.threads < 1:
             raise SkyfixError(f"threads: expected at least 1, got {self.threads}")
-        if not 0.0 <= self.injection_share < 1.0:
-            raise SkyfixError(f"injection_share: expected in [0, 1), got {self.injection_share}")
+        for name in ("injection_share", "guided_share"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise SkyfixError(f"{name}: expected in [0, 1), got {getattr(self, name)}")
+        for name in ("standstill_m", "standstill_rad"):
+            if not (isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise SkyfixError(f"{name}: expected >= 0, got {getattr(self, name)}")
         if not isfinite(self.collapse_log_evidence_margin):
             raise SkyfixError(
                 f"collapse_log_evidence_margin: expected a number, got {self.collapse_log_evidence_margin}"

@@ -33,7 +33,7 @@ def silverman_bandwidth(count: FloatOrArray, dimensions: int) -> FloatOrArray:
 
 
 def is_compact(covariance: list[list[float]]) -> bool:
-    """Whether a cloud is so narrow that it is one cluster: within a cell of `fusion.clusters` either way of its mean."""
+    """Whether a cloud is narrow enough to be one cluster: its spread less than a cell of `fusion.clusters`."""
     return max(covariance[0][0], covariance[1][1]) < CELL_M**2 and covariance[2][2] < CELL_RAD**2
 
 

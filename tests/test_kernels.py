@@ -1,4 +1,4 @@
-"""The compiled step: known answers, the accuracy it states, and nothing that depends on threads or on being looked at."""
+"""The compiled step: known answers, the accuracy it states, and nothing that depends on threads or on looking."""
 
 import numba
 import numpy as np
@@ -170,7 +170,9 @@ def test_moments_are_those_of_float64(count, spread):
     off = np.array(moments.mean) + [*cloud.anchor, 0.0] - mean
     off[2] = se2.wrap(off[2])
     assert (np.abs(off) < 2e-5 * sigma + 1e-6).all()
-    np.testing.assert_allclose(moments.covariance / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-4)
+    np.testing.assert_allclose(
+        moments.covariance / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-4
+    )
     assert moments.effective_sample_size == pytest.approx(1.0 / (weights**2).sum(), rel=1e-5)
 
 
