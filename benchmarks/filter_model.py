@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from fusion import LikelihoodVolume, MapGrid, OdometryIncrement, se2
-from fusion.arrays import Float32Array, FloatArray
+from fusion.arrays import Float32Array, FloatArray, IntArray
 from fusion.likelihood import log_uniform_density
 
 SEED = 0
@@ -23,7 +23,10 @@ Estimated = tuple[FloatArray, FloatArray]
 class Lookup(Protocol):
     """ln density (N,) of a volume at poses (N, 3)."""
 
-    volume: LikelihoodVolume
+    @property
+    def volume(self) -> LikelihoodVolume:
+        """What is looked up."""
+        ...
 
     def __call__(self, poses: FloatArray) -> FloatArray:
         """Trilinear between the cells, the floor outside the crop."""
@@ -104,7 +107,7 @@ class NumpyLookup:
         fr, fc, fk = ((a - b).astype(np.float32) for a, b in ((row, r), (col, c), (heading, k)))
         at, east, south = (r * grid.cols + c) * (bins + 1) + k, bins + 1, grid.cols * (bins + 1)
 
-        def between(index: FloatArray) -> FloatArray:
+        def between(index: IntArray) -> Float32Array:
             low = self.flat.take(index)
             return low + fk * (self.flat.take(index + 1) - low)
 

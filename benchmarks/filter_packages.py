@@ -39,17 +39,13 @@ def particles_filter(cloud: FloatArray, lookup: Lookup) -> Callable[[], Estimate
 
     rng = np.random.default_rng(SEED)
 
-    class Drive(FeynmanKac):
-        def M0(self, N: int) -> FloatArray:
-            return cloud.copy()
-
-        def M(self, t: int, xp: FloatArray) -> FloatArray:
-            return moved(xp, rng)
-
-        def logG(self, t: int, xp: FloatArray, x: FloatArray) -> FloatArray:
-            return np.log(mixture(lookup, x)) if t else np.zeros(len(x))
-
-    smc = SMC(fk=Drive(T=4), N=len(cloud), resampling="systematic", ESSrmin=2.0)
+    methods = {  # names are the package's
+        "M0": lambda self, N: cloud.copy(),
+        "M": lambda self, t, xp: moved(xp, rng),
+        "logG": lambda self, t, xp, x: np.log(mixture(lookup, x)) if t else np.zeros(len(x)),
+    }
+    drive = type("Drive", (FeynmanKac,), methods)(T=4)
+    smc = SMC(fk=drive, N=len(cloud), resampling="systematic", ESSrmin=2.0)
     next(smc)
 
     def step() -> Estimated:

@@ -130,7 +130,8 @@ class Cloud:
         self._count = len(poses)
         self._log_weights = _EQUAL if log_weights is None else log_weights - log_weights.max()
         self._shift = 0.0
-        self._ancestors, self._motion, self._resamples = _NOBODY, None, False
+        self._ancestors = _NOBODY
+        self._motion: FloatArray | None = None
         self._sums = np.zeros((0, SUMS))
         self._reference = (0.0, 0.0, float(poses[0, 2]))
         self._moments: Moments | None = self._pass(None, 0.0)

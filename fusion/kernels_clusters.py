@@ -1,10 +1,12 @@
 """Connected components of occupied cells of position and heading, and the moments of each, compiled by numba."""
 
+from typing import Any
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
 @numba.njit(**_OPTIONS)

@@ -68,7 +68,8 @@ class LatticeDensity:
         empty = cls(poses, weights, cell, np.zeros(0, np.int64), np.zeros(0), origin, rows, turns)
         numbers, shares = zip(*empty._corners(poses), strict=True)
         nodes, place = np.unique(np.concatenate(numbers), return_inverse=True)
-        masses = np.bincount(place, weights=np.concatenate(shares) * np.tile(weights, 8), minlength=len(nodes))
+        masses = np.zeros(len(nodes))
+        np.add.at(masses, place, np.concatenate(shares) * np.tile(weights, 8))
         return cls(poses, weights, cell, nodes, masses, origin, rows, turns)
 
     def log_density(self, poses: FloatArray) -> FloatArray:

@@ -105,17 +105,16 @@ class LikelihoodVolume:
         expected = (self.grid.rows, self.grid.cols)
         if log_prob.ndim != 3 or log_prob.shape[:2] != expected or log_prob.shape[2] < 1:
             raise SkyfixError(f"likelihood: expected ({expected[0]}, {expected[1]}, K), got {log_prob.shape}")
-        floor = np.float32(self.floor)
-        peaks, evaluated, bad = survey(read_only(log_prob).reshape(-1, log_prob.shape[2]), floor)
+        floor = float(np.float32(self.floor))
+        peaks, evaluated, bad = survey(read_only(log_prob).reshape(-1, log_prob.shape[2]), np.float32(floor))
         if bad or not np.isfinite(floor):
             raise SkyfixError("likelihood: expected finite log densities and floor, got NaN or an infinity")
-        floor = float(floor)
         if peaks.max() <= floor:
             raise SkyfixError(f"likelihood: expected a cell above the floor of {floor:g}, got none")
         object.__setattr__(self, "log_prob", read_only(log_prob))
         object.__setattr__(self, "floor", floor)
         object.__setattr__(self, "bin_peaks", read_only(peaks.astype(np.float64)))
-        object.__setattr__(self, "evaluated_cells", evaluated)
+        object.__setattr__(self, "evaluated_cells", int(evaluated))
 
     @property
     def cell_volume(self) -> float:
