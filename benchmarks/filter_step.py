@@ -1,10 +1,9 @@
-"""One step of a particle filter on a likelihood volume, and its two dearest parts alone: lookup and resampling.
+"""One step of a particle filter on a likelihood volume beside its peers, and its dearest parts alone.
 
-A step moves N particles by a noisy increment, weights them by a volume of 96 x 96 cells and 360 headings, resamples
-and gives mean and covariance. The peer is put together as filterpy's documentation and its author's book show it:
-weights multiplied in numpy, `filterpy.monte_carlo.systematic_resample`; filterpy has no maps, so
-`scipy.ndimage.map_coordinates` looks the volume up. It has the same measurement model, outliers included, and the
-same noise for the same seed, so that both give the same estimate. Only skyfix keeps log weights and a lost score.
+A step moves N particles by a noisy increment, weighs them by a volume, resamples and gives mean and covariance. All
+implementations have the same motion, the same measurement model (trilinear, with outliers) and systematic resampling
+at every step; see `filter_peers` and `filter_packages`. 'floor' is no filter: it reads the eight cells around every
+particle at random and adds them up, which no filter that looks up a volume can beat.
 
 Everything here is made up by formula: a cloud, and a volume with two peaks over clutter.
 """
@@ -12,51 +11,27 @@ Everything here is made up by formula: a cloud, and a volume with two peaks over
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from filterpy.monte_carlo import systematic_resample
-from scipy.ndimage import map_coordinates
 
+from benchmarks.filter_model import INCREMENT, SEED, Estimated, NumpyLookup, ScipyLookup, cloud, example_volume
+from benchmarks.filter_packages import package_candidates
+from benchmarks.filter_peers import FilterpyFilter, NumpyFilter, TorchFilter
+from benchmarks.gather_floor import gather_floor
 from benchmarks.runner import Candidate, Case
-from fusion import LikelihoodVolume, MapGrid, OdometryIncrement, ParticleFilter, ParticleFilterSettings, se2
-from fusion.arrays import Float32Array, FloatArray
-from fusion.likelihood import log_uniform_density
-from fusion.regularisation import matrix_root
+from fusion import LikelihoodVolume, OdometryIncrement, ParticleFilter, ParticleFilterSettings
+from fusion.arrays import FloatArray
 from fusion.resampling import systematic
 
-SIZES = (1_000, 10_000, 100_000)
-SEED = 0
-INCREMENT = OdometryIncrement(1, np.array([1.0, 0.0, 0.02]), np.diag([0.05, 0.03, 0.01]) ** 2)
+SIZES = (1_000, 10_000, 100_000, 1_000_000)
+MAP_SIDES = (64, 128, 256, 512)
+MAP_PARTICLES = 100_000
 SAME_WORK = ParticleFilterSettings(ess_fraction=1.0, regularisation=0.0)
-"""Resample at every step and add no kernel noise, as the peer does."""
+"""Resample at every step and add no kernel noise, as the peers do."""
 WITH_KERNEL_NOISE = ParticleFilterSettings(ess_fraction=1.0)
-
-Estimated = tuple[FloatArray, FloatArray]
-
-
-def example_volume(cells: int = 96, bins: int = 360) -> LikelihoodVolume:
-    """Two peaks of 1 m and 3 degrees, one of them twice as high, over clutter; cells of half a metre."""
-    grid = MapGrid(cells, cells, 0.5, -0.25 * cells, -0.25 * cells)
-    x, y = grid.centres()
-    yaw = se2.TWO_PI * np.arange(bins) / bins
-
-    def peak(x0: float, y0: float, yaw0: float) -> FloatArray:
-        squared = (x[None, :, None] - x0) ** 2 + (y[:, None, None] - y0) ** 2
-        return -0.5 * squared + (np.cos(yaw - yaw0) - 1.0) / np.deg2rad(3.0) ** 2
-
-    quarter = 0.125 * cells
-    scores = np.logaddexp(peak(0.0, 0.0, 0.1), peak(quarter, -quarter, 0.1 + np.pi) - np.log(2.0))
-    return LikelihoodVolume.from_scores(np.logaddexp(scores, -12.0), grid)
-
-
-def cloud(volume: LikelihoodVolume, count: int, spread: bool) -> FloatArray:
-    """Particles (count, 3): all over the crop, or around the higher peak as in tracking."""
-    rng = np.random.default_rng(SEED)
-    if spread:
-        half = np.array([0.5 * volume.grid.width_m, 0.5 * volume.grid.height_m, np.pi])
-        return rng.uniform(-half, half, (count, 3))
-    return np.array([-1.0, 0.0, 0.08]) + rng.standard_normal((count, 3)) * [1.0, 1.0, 0.05]
+_STANDSTILL = OdometryIncrement(0, np.zeros(3), np.zeros((3, 3)))
 
 
 def skyfix_step(particles: ParticleFilter, volume: LikelihoodVolume) -> Estimated:
@@ -67,105 +42,63 @@ def skyfix_step(particles: ParticleFilter, volume: LikelihoodVolume) -> Estimate
     return estimate.pose, estimate.covariance
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScipyLookup:
-    """Trilinear lookup in a volume by map_coordinates, its headings padded once so that they wrap."""
+def _skyfix(particles: FloatArray, volume: LikelihoodVolume, settings: ParticleFilterSettings) -> Candidate:
+    def prepare() -> Callable[[], Estimated]:
+        started = ParticleFilter(particles, SEED, settings)
+        started.predict(_STANDSTILL)  # a filter that has moved before: its memory is in place
+        started.estimate(0)
+        return lambda: skyfix_step(started, volume)
 
-    padded: Float32Array
-    volume: LikelihoodVolume
-
-    @classmethod
-    def of(cls, volume: LikelihoodVolume) -> ScipyLookup:
-        """Pad the volume by its first heading."""
-        return cls(np.concatenate([volume.log_prob, volume.log_prob[:, :, :1]], axis=2), volume)
-
-    def __call__(self, poses: FloatArray) -> FloatArray:
-        """ln density (N,) at poses (N, 3); the floor outside the crop."""
-        grid = self.volume.grid
-        row, col = (grid.pixel_from_xy(poses[:, :2]) - 0.5).T
-        turns = poses[:, 2] / se2.TWO_PI
-        heading = (turns - np.floor(turns)) * (self.padded.shape[2] - 1)
-        values = map_coordinates(self.padded, [row, col, heading], output=np.float64, order=1, mode="nearest")
-        return np.where(grid.contains(poses[:, :2]), values, self.volume.floor)
+    name = "skyfix" if settings.regularisation == 0.0 else "skyfix with kernel noise (its default)"
+    return Candidate(name if settings.threads == 1 else f"{name}, {settings.threads} threads", prepare)
 
 
-@dataclass(slots=True, eq=False)
-class FilterpyFilter:
-    """A particle filter from filterpy's parts: particles and weights in arrays, its resampling between them."""
-
-    particles: FloatArray
-    weights: FloatArray
-    lookup: ScipyLookup
-    rng: np.random.Generator
-
-    def step(self) -> Estimated:
-        """Mean (3,) and covariance (3, 3) after predict, update, resample."""
-        noise = self.rng.standard_normal(self.particles.shape) @ matrix_root(INCREMENT.covariance).T
-        forward, left, turn = (INCREMENT.delta + noise).T
-        cos, sin = np.cos(self.particles[:, 2]), np.sin(self.particles[:, 2])
-        self.particles[:, 0] += cos * forward - sin * left
-        self.particles[:, 1] += sin * forward + cos * left
-        self.particles[:, 2] = (self.particles[:, 2] + turn + np.pi) % se2.TWO_PI - np.pi
-
-        outlier = SAME_WORK.outlier_probability
-        uniform = np.exp(log_uniform_density(self.lookup.volume.grid))
-        self.weights *= (1.0 - outlier) * np.exp(self.lookup(self.particles)) + outlier * uniform
-        self.weights += 1e-300
-        self.weights /= self.weights.sum()
-
-        indexes = systematic_resample(self.weights)
-        self.particles[:] = self.particles[indexes]
-        self.weights.fill(1.0 / len(self.weights))
-
-        mean = np.average(self.particles, weights=self.weights, axis=0)
-        mean[2] = np.arctan2(self.weights @ np.sin(self.particles[:, 2]), self.weights @ np.cos(self.particles[:, 2]))
-        residual = self.particles - mean
-        residual[:, 2] = (residual[:, 2] + np.pi) % se2.TWO_PI - np.pi
-        return mean, (self.weights[:, None] * residual).T @ residual
+def _floor(particles: FloatArray, volume: LikelihoodVolume) -> Candidate:
+    return Candidate("floor: the gather alone", lambda: gather_floor(particles, volume))
 
 
-def filterpy_filter(particles: FloatArray, lookup: ScipyLookup) -> FilterpyFilter:
-    """The peer at its start, on a copy of the particles (N, 3)."""
-    count = len(particles)
-    return FilterpyFilter(particles.copy(), np.full(count, 1.0 / count), lookup, np.random.default_rng(SEED))
-
-
-def _steps(particles: FloatArray, volume: LikelihoodVolume, lookup: ScipyLookup) -> tuple[Candidate, ...]:
-    def skyfix(settings: ParticleFilterSettings) -> Callable[[], Callable[[], Estimated]]:
-        def prepare() -> Callable[[], Estimated]:
-            started = ParticleFilter(particles, SEED, settings)
-            return lambda: skyfix_step(started, volume)
-
-        return prepare
-
+def _steps(particles: FloatArray, volume: LikelihoodVolume) -> tuple[Candidate, ...]:
+    numpy_lookup, scipy_lookup = NumpyLookup.of(volume), ScipyLookup.of(volume)
     return (
-        Candidate("skyfix", skyfix(SAME_WORK)),
-        Candidate("skyfix with kernel noise (its default)", skyfix(WITH_KERNEL_NOISE)),
-        Candidate("filterpy parts + scipy map_coordinates", lambda: filterpy_filter(particles, lookup).step),
+        _skyfix(particles, volume, SAME_WORK),
+        _skyfix(particles, volume, WITH_KERNEL_NOISE),
+        _skyfix(particles, volume, replace(SAME_WORK, threads=2)),
+        _floor(particles, volume),
+        Candidate("vectorised numpy", lambda: NumpyFilter.start(particles, numpy_lookup).step),
+        Candidate("torch grid_sample", lambda: TorchFilter.start(particles, volume).step),
+        Candidate("filterpy parts + scipy map_coordinates", lambda: FilterpyFilter.start(particles, scipy_lookup).step),
+        *package_candidates(particles, numpy_lookup),
     )
 
 
-def cases(sizes: Sequence[int] = SIZES, volume: LikelihoodVolume | None = None) -> Iterator[Case]:
-    """Steps while tracking and with a cloud all over the crop, then lookup and resampling alone, at each size."""
+def cases(
+    sizes: Sequence[int] = SIZES, volume: LikelihoodVolume | None = None, map_sides: Sequence[int] = MAP_SIDES
+) -> Iterator[Case]:
+    """Steps while tracking and all over the crop at each size, steps on maps of each side, lookup and resampling."""
     volume = volume or example_volume()
-    lookup = ScipyLookup.of(volume)
     for size in sizes:
         for name, spread in (("step, tracking", False), ("step, spread", True)):
-            yield Case(name, size, _steps(cloud(volume, size, spread), volume, lookup))
+            yield Case(name, size, _steps(cloud(volume, size, spread), volume))
+    for side in map_sides:
+        wide = example_volume(side, 64)
+        particles = cloud(wide, min(MAP_PARTICLES, max(sizes)), spread=True)
+        candidates = (_skyfix(particles, wide, SAME_WORK), _floor(particles, wide))
+        yield Case(f"step, spread, map of {side} x {side} x 64", len(particles), candidates)
     for size in sizes:
-        yield _lookup_case(cloud(volume, size, spread=True), volume, lookup)
+        yield _lookup_case(cloud(volume, size, spread=True), volume)
     for size in sizes:
         yield _resampling_case(size)
 
 
-def _lookup_case(poses: FloatArray, volume: LikelihoodVolume, lookup: ScipyLookup) -> Case:
-    ours = Candidate("skyfix", lambda: lambda: volume.log_density(poses))
+def _lookup_case(poses: FloatArray, volume: LikelihoodVolume) -> Case:
+    lookup = ScipyLookup.of(volume)
+    ours = Candidate("skyfix log_density (numpy)", lambda: lambda: volume.log_density(poses))
     return Case("lookup, spread", len(poses), (ours, Candidate("scipy map_coordinates", lambda: lambda: lookup(poses))))
 
 
 def _resampling_case(count: int) -> Case:
     weights = np.random.default_rng(SEED).dirichlet(np.ones(count))
     rng = np.random.default_rng(SEED)
-    ours = Candidate("skyfix", lambda: lambda: systematic(weights, count, rng))
+    ours = Candidate("skyfix systematic (numpy)", lambda: lambda: systematic(weights, count, rng))
     peer = Candidate("filterpy systematic_resample", lambda: lambda: systematic_resample(weights))
     return Case("systematic resampling", count, (ours, peer))

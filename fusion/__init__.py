@@ -22,6 +22,7 @@ from fusion.grid import MapGrid
 from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
 from fusion.kalman_filter import KalmanFilter, KalmanFilterSettings
+from fusion.kld_sampling import KldSampling
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
 from fusion.location_orientation import LocationOrientationMaps
@@ -52,6 +53,7 @@ __all__ = [
     "GridSmootherResult",
     "KalmanFilter",
     "KalmanFilterSettings",
+    "KldSampling",
     "LikelihoodEmulator",
     "LikelihoodVolume",
     "LocationOrientationMaps",

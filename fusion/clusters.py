@@ -1,7 +1,8 @@
 """Clusters of a cloud of poses: groups of particles with empty space between them.
 
 Particles are binned into cells of position and heading; cells that touch, corners and the seam of the circle included,
-belong together. The cost is that of sorting the cloud, whatever its shape and extent.
+belong together. The cost is linear in the particles and, up to a limit, in the cells that the cloud spans; beyond it
+the cost is that of sorting the cloud.
 """
 
 from dataclasses import dataclass
@@ -14,9 +15,12 @@ from scipy.sparse.csgraph import connected_components
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
 from fusion.gaussian_mixture import GaussianMixture
+from fusion.kernels_clusters import cells_of, components, moments_of
 
-_CELL_M = 2.0
+CELL_M = 2.0
 _YAW_CELLS = 24  # 15 degrees each
+_MOST_CELLS = 2**24
+CELL_RAD = se2.TWO_PI / _YAW_CELLS
 _HALF_OF_THE_NEIGHBOURS = [offset for offset in product((-1, 0, 1), repeat=3) if offset > (0, 0, 0)]
 VARIANCE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])  # 1 mm and 0.1 mrad: keeps a collapsed cloud invertible
 
@@ -60,40 +64,33 @@ class Clusters:
 
 
 def _labels(poses: FloatArray) -> tuple[IntArray, int]:
-    plane = np.floor((poses[:, :2] - poses[:, :2].min(axis=0)) / _CELL_M).astype(np.int64) + 1
-    stride = int(plane[:, 1].max()) + 2  # an empty column on either side: no neighbour is found across it
-    turns = poses[:, 2] / se2.TWO_PI
-    yaw = np.minimum(((turns - np.floor(turns)) * _YAW_CELLS).astype(np.int64), _YAW_CELLS - 1)
-    cells, cell_of = np.unique((plane[:, 0] * stride + plane[:, 1]) * _YAW_CELLS + yaw, return_inverse=True)
+    x0, y0 = poses[:, 0].min(), poses[:, 1].min()
+    rows = int((poses[:, 0].max() - x0) / CELL_M) + 3  # an empty row and column on either side
+    cols = int((poses[:, 1].max() - y0) / CELL_M) + 3
+    cells, size = cells_of(poses, x0, y0, CELL_M, cols, _YAW_CELLS), rows * cols * _YAW_CELLS
+    if size <= _MOST_CELLS:
+        return components(cells, size, cols, _YAW_CELLS)
+    return _sparse_components(cells, cols)
+
+
+def _sparse_components(cell_of: IntArray, cols: int) -> tuple[IntArray, int]:
+    """Labels (N,) and their number by sorting the cells, for a cloud so wide that its grid would not fit."""
+    cells, place_of = np.unique(cell_of, return_inverse=True)
     column, yaw = np.divmod(cells, _YAW_CELLS)
     links = []
     for dx, dy, dt in _HALF_OF_THE_NEIGHBOURS:
-        wanted = (column + dx * stride + dy) * _YAW_CELLS + (yaw + dt) % _YAW_CELLS
+        wanted = (column + dx * cols + dy) * _YAW_CELLS + (yaw + dt) % _YAW_CELLS
         found = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
         hit = np.flatnonzero(cells[found] == wanted)
         links.append(np.stack([hit, found[hit]]))
     a, b = np.concatenate(links, axis=1)
     graph = coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(cells), len(cells)))
     count, label_of_cell = connected_components(graph, directed=False)
-    return label_of_cell.astype(np.int64)[cell_of], int(count)
+    return label_of_cell.astype(np.int64)[place_of], int(count)
 
 
 def find_clusters(poses: FloatArray, weights: FloatArray) -> Clusters:
     """Partition poses (N, 3) with non-negative weights (N,) that sum to 1; a weightless cluster gets equal weights."""
+    poses, weights = np.ascontiguousarray(poses), np.ascontiguousarray(weights)
     labels, count = _labels(poses)
-
-    def total(values: FloatArray) -> FloatArray:
-        return np.bincount(labels, weights=values, minlength=count).astype(np.float64)
-
-    mass = total(weights)
-    share = np.where(mass[labels] > 0.0, weights, 1.0)
-    scale = total(share)
-    share = share / scale[labels]
-    yaw = np.arctan2(total(share * np.sin(poses[:, 2])), total(share * np.cos(poses[:, 2])))
-    means = np.column_stack([total(share * poses[:, 0]), total(share * poses[:, 1]), se2.wrap(yaw)])
-    partition = Clusters(labels, mass, means, np.zeros((count, 3, 3)))
-    residual = partition.residuals(poses)
-    covariances = np.empty((count, 3, 3))
-    for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-        covariances[:, i, j] = covariances[:, j, i] = total(share * residual[:, i] * residual[:, j])
-    return Clusters(labels, mass, means, covariances)
+    return Clusters(labels, *moments_of(poses, weights, labels, count))

@@ -46,6 +46,11 @@ class GaussianLikelihood:
         object.__setattr__(self, "mean", mixture.means[0])
         object.__setattr__(self, "covariance", mixture.covariances[0])
 
+    @property
+    def searched_volume(self) -> float:
+        """The grid times all headings, m^2 rad."""
+        return self.grid.area_m2 * se2.TWO_PI
+
     def log_density(self, poses: ArrayLike) -> FloatArray:
         """ln density (N,) at poses (N, 3), yaw residuals wrapped."""
         return np.maximum(self.modes(1).log_density(poses), self.floor)
@@ -55,6 +60,10 @@ class GaussianLikelihood:
         poses = rng.multivariate_normal(self.mean, self.covariance, size=n, method="cholesky")
         poses[:, 2] = se2.wrap(poses[:, 2])
         return poses
+
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """The Gaussian's own ln density (N,) at poses (N, 3), without a floor."""
+        return self.modes(1).log_density(poses)
 
     def modes(self, k: int) -> GaussianMixture:
         """The Gaussian itself."""

@@ -17,6 +17,8 @@ from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.interpolation import corners
+from fusion.kernels_likelihood import survey, tempered_mass
+from fusion.lookup import MOST_CELLS, Lookup
 from fusion.modes import circular_run, find_modes
 
 DEFAULT_FLOOR = -40.0
@@ -30,12 +32,21 @@ class PoseLikelihood(Protocol):
         """The crop that was searched."""
         ...
 
+    @property
+    def searched_volume(self) -> float:
+        """Volume, m^2 rad, of the poses that were evaluated: the crop times the headings looked at."""
+        ...
+
     def log_density(self, poses: ArrayLike) -> FloatArray:
         """ln density (N,) per m^2 rad at poses (N, 3); finite everywhere."""
         ...
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw poses (n, 3) from the density."""
+        ...
+
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """ln density (N,) at poses (N, 3) of what `sample` draws from: `log_density` up to interpolation."""
         ...
 
     def modes(self, k: int) -> GaussianMixture:
@@ -87,26 +98,47 @@ class LikelihoodVolume:
     grid: MapGrid
     floor: float = DEFAULT_FLOOR
     bin_peaks: FloatArray = field(init=False, repr=False)
+    evaluated_cells: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         log_prob = np.ascontiguousarray(self.log_prob, dtype=np.float32)
         expected = (self.grid.rows, self.grid.cols)
         if log_prob.ndim != 3 or log_prob.shape[:2] != expected or log_prob.shape[2] < 1:
             raise SkyfixError(f"likelihood: expected ({expected[0]}, {expected[1]}, K), got {log_prob.shape}")
-        peaks, lows = (reduce(log_prob.reshape(-1, log_prob.shape[2]), axis=0) for reduce in (np.max, np.min))
-        if not (np.isfinite(peaks).all() and np.isfinite(lows).all() and np.isfinite(self.floor)):
-            raise SkyfixError("likelihood: expected finite log densities and floor, got NaN or an infinity")
         floor = float(np.float32(self.floor))
+        peaks, evaluated, bad = survey(read_only(log_prob).reshape(-1, log_prob.shape[2]), np.float32(floor))
+        if bad or not np.isfinite(floor):
+            raise SkyfixError("likelihood: expected finite log densities and floor, got NaN or an infinity")
         if peaks.max() <= floor:
             raise SkyfixError(f"likelihood: expected a cell above the floor of {floor:g}, got none")
         object.__setattr__(self, "log_prob", read_only(log_prob))
         object.__setattr__(self, "floor", floor)
         object.__setattr__(self, "bin_peaks", read_only(peaks.astype(np.float64)))
+        object.__setattr__(self, "evaluated_cells", int(evaluated))
 
     @property
     def cell_volume(self) -> float:
         """Volume of a cell, m^2 rad."""
         return float(self.grid.metres_per_pixel**2 * se2.TWO_PI / self.log_prob.shape[2])
+
+    @property
+    def searched_volume(self) -> float:
+        """Volume of the cells above the floor, m^2 rad."""
+        return self.evaluated_cells * self.cell_volume
+
+    def lookup(self, temperature: float) -> Lookup | None:
+        """What the compiled filter step reads: this array, and the constants of :meth:`tempered`."""
+        bins = self.log_prob.shape[2]
+        if self.log_prob.size > MOST_CELLS:
+            return None
+        table, floor, scale, shift = self.log_prob.reshape(-1), self.floor, 1.0, 0.0
+        if checked_temperature(temperature) != 1.0:
+            peak = float(self.bin_peaks.max())
+            scale = 1.0 / temperature
+            mass, least = tempered_mass(table, np.float32(floor), np.float32(peak), np.float32(scale))
+            shift = -scale * peak - float(np.log(mass * self.cell_volume))
+            floor = min(floor, scale * float(least) + shift - 1.0)
+        return Lookup(table, self.grid, bins, scale, shift, self.floor, floor)
 
     @classmethod
     def from_scores(
@@ -174,6 +206,16 @@ class LikelihoodVolume:
         xy = self.grid.xy_from_pixel(np.stack([row, col], axis=-1) + jitter[:, :2])
         yaw = se2.wrap((yaw_bin + jitter[:, 2] - 0.5) * se2.TWO_PI / bin_count)
         return np.column_stack([xy, yaw])
+
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """The log density (N,) of the cell that each pose (N, 3) lies in; the floor outside the crop."""
+        poses = checked("poses", poses, ("N", 3))
+        bins = self.log_prob.shape[2]
+        yaw_bin = np.rint(poses[:, 2] * (bins / se2.TWO_PI)).astype(np.int64) % bins
+        inside = self.grid.contains(poses[:, :2])
+        row, col = np.where(inside, self.grid.pixel_from_xy(poses[:, :2]).T, 0.0).astype(np.int64)
+        row, col = np.minimum(row, self.grid.rows - 1), np.minimum(col, self.grid.cols - 1)
+        return np.where(inside, self.log_prob[row, col, yaw_bin].astype(np.float64), self.floor)
 
     def modes(self, k: int) -> GaussianMixture:
         """The at most `k` highest modes, as Gaussians with the moments of the mass around them."""
@@ -243,6 +285,11 @@ class OutlierMixture:
         """The crop that was searched."""
         return self.likelihood.grid
 
+    @property
+    def searched_volume(self) -> float:
+        """That of the likelihood."""
+        return self.likelihood.searched_volume
+
     def log_density(self, poses: ArrayLike) -> FloatArray:
         """ln density (N,) of the mixture at poses (N, 3)."""
         inner = self.likelihood.log_density(poses)
@@ -259,6 +306,15 @@ class OutlierMixture:
         xy = self.grid.xy_from_pixel(unit[:, :2] * (self.grid.rows, self.grid.cols))
         uniform = np.column_stack([xy, se2.wrap(unit[:, 2] * se2.TWO_PI)])
         return np.where(outlier[:, None], uniform, poses)
+
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """That of the likelihood, and outliers inside the crop only."""
+        poses = checked("poses", poses, ("N", 3))
+        inner = self.likelihood.draw_log_density(poses)
+        if self.probability == 0.0:
+            return inner
+        uniform = np.where(self.grid.contains(poses[:, :2]), np.log(self.probability), DEFAULT_FLOOR)
+        return np.logaddexp(np.log1p(-self.probability) + inner, uniform + log_uniform_density(self.grid))
 
     def modes(self, k: int) -> GaussianMixture:
         """The modes of the likelihood, their weights times 1 - p."""

@@ -15,7 +15,9 @@ from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.interpolation import corners
+from fusion.kernels_likelihood import log_mass_of_maps
 from fusion.likelihood import DEFAULT_FLOOR, LikelihoodVolume, OutlierMixture, checked_temperature
+from fusion.lookup import MOST_CELLS, Lookup
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +65,25 @@ class LocationOrientationMaps:
         object.__setattr__(self, "location", read_only(location))
         object.__setattr__(self, "orientation", read_only(orientation))
 
+    @property
+    def searched_volume(self) -> float:
+        """The crop times all headings, m^2 rad."""
+        return self.grid.area_m2 * se2.TWO_PI
+
+    def lookup(self, temperature: float) -> Lookup | None:
+        """What the compiled filter step reads: these arrays, and the constants of :meth:`tempered`."""
+        bins, pixels = self.orientation.shape[0], self.location.size
+        if self.orientation.size > MOST_CELLS:
+            return None
+        scale, shift = 1.0 / checked_temperature(temperature), 0.0
+        location = self.location.reshape(-1)
+        if scale != 1.0:
+            mass = log_mass_of_maps(location, self.orientation.reshape(bins, pixels), np.float32(scale))
+            shift = -(mass + float(np.log(self.grid.metres_per_pixel**2 * se2.TWO_PI / bins)))
+        slots = np.arange(pixels, dtype=np.int32)
+        table, floor = self.orientation.reshape(-1), self.floor
+        return Lookup(table, self.grid, bins, scale, shift, floor, floor, location, slots, 1, pixels)
+
     def to_volume(self) -> LikelihoodVolume:
         """The joint density as one array of cells."""
         joint = self.location[:, :, None] + np.moveaxis(self.orientation, 0, 2)
@@ -90,6 +111,17 @@ class LocationOrientationMaps:
         jitter = rng.random((n, 3))
         xy = self.grid.xy_from_pixel(np.stack([row, col], axis=-1) + jitter[:, :2])
         return np.column_stack([xy, se2.wrap((yaw_bin + jitter[:, 2] - 0.5) * se2.TWO_PI / bin_count)])
+
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """The log density (N,) of the cell that each pose (N, 3) lies in; the floor outside the crop."""
+        poses = checked("poses", poses, ("N", 3))
+        bins = self.orientation.shape[0]
+        yaw_bin = np.rint(poses[:, 2] * (bins / se2.TWO_PI)).astype(np.int64) % bins
+        inside = self.grid.contains(poses[:, :2])
+        row, col = np.where(inside, self.grid.pixel_from_xy(poses[:, :2]).T, 0.0).astype(np.int64)
+        row, col = np.minimum(row, self.grid.rows - 1), np.minimum(col, self.grid.cols - 1)
+        joint = self.location[row, col].astype(np.float64) + self.orientation[yaw_bin, row, col]
+        return np.where(inside, joint, self.floor)
 
     def modes(self, k: int) -> GaussianMixture:
         """The at most `k` highest modes of the joint density."""

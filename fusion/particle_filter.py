@@ -1,94 +1,42 @@
 """The particle filter: online fusion of odometry increments with map likelihoods.
 
-Sequential importance resampling on SE(2) with log weights, kernel regularisation and a model of being lost.
+Sequential importance resampling on SE(2) with log weights, kernel regularisation and a model of being lost, see
+`fusion.lost`. When the log odds of being lost exceed a margin, particles drawn from the likelihood are injected with
+the total weight `lost_score`: exactly the posterior of the mixture of both states.
 
-Being lost is the second state of a two-state hidden Markov model. A filter that is on track gives a measurement the
-evidence ``Z = sum_i w_i L(x_i)``; a lost one gives it ``1 / V``, the evidence of a pose uniform over the crop of volume
-V, because L integrates to 1 there. With the probability of becoming lost and of recovering between two measurements,
-
-    lost' = lost (1 - recovery) + (1 - lost) kidnap
-    lost_score = lost' / V / (lost' / V + (1 - lost') Z)
-
-When its log odds exceed a margin, particles drawn from the likelihood are injected with the total weight `lost_score`:
-exactly the posterior of the mixture of both states. Z is taken before the weights are normalised, otherwise this could
-never fire.
+A step is one pass over the particles, see `fusion.cloud`: `predict` writes an increment down, and the `update` that
+follows moves, weighs and sums. Estimates are of the weighted cloud, before resampling adds its noise.
 
 Sources: Gordon, Salmond, Smith 1993; Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, 8.3.5 (augmented MCL).
 """
 
-from dataclasses import dataclass
+from math import hypot, inf
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import expit, logit, logsumexp
 
 from fusion import se2
 from fusion.arrays import FloatArray, checked, read_only
-from fusion.clusters import VARIANCE_FLOOR, find_clusters
+from fusion.cloud import Cloud, positive_definite
+from fusion.clusters import find_clusters
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
-from fusion.likelihood import PoseLikelihood, log_uniform_density
+from fusion.grid import MapGrid
+from fusion.guided_proposal import guided
+from fusion.lattice_density import LatticeDensity
+from fusion.likelihood import OutlierMixture, PoseLikelihood, checked_temperature
+from fusion.lookup import lookup_of
+from fusion.lost import LostModel, log_uniform_evidence, probability
+from fusion.map_start import stratified_poses
 from fusion.odometry import OdometryIncrement
+from fusion.particle_filter_settings import ParticleFilterSettings
 from fusion.pose_filter import UpdateReport
 from fusion.prior import UniformPrior
-from fusion.regularisation import matrix_root, regularised
-from fusion.resampling import RESAMPLERS, effective_sample_size
+from fusion.regularisation import is_compact, regularised, silverman_bandwidth
+from fusion.resampling import RESAMPLERS
 
-
-@dataclass(frozen=True, slots=True)
-class ParticleFilterSettings:
-    """How the filter behaves.
-
-    Parameters
-    ----------
-    resampler : str
-        Name in `fusion.resampling.RESAMPLERS`.
-    ess_fraction : float
-        Resample when the effective sample size falls below this share of the particles, in [0, 1].
-    outlier_probability : float
-        Chance that a measurement is about nothing, in (0, 1); bounds what one measurement can do.
-    regularisation : float
-        Kernel noise after resampling, in units of Silverman's bandwidth, in [0, 1]; 0 switches it off.
-    kidnap_probability : float
-        Chance of getting lost between two measurements, in (0, 1).
-    recovery_probability : float
-        Chance of being on track again at the next measurement once lost, in (0, 1).
-    collapse_log_evidence_margin : float
-        Inject particles when being lost is ahead of being on track by this many nats.
-    injection_share : float
-        Share of the particles that is injected then, in [0, 1); 0 switches recovery off.
-
-    Raises
-    ------
-    SkyfixError
-        When a value is out of range or the resampler unknown.
-    """
-
-    resampler: str = "systematic"
-    ess_fraction: float = 0.5
-    outlier_probability: float = 0.05
-    regularisation: float = 0.5
-    kidnap_probability: float = 1e-3
-    recovery_probability: float = 0.1
-    collapse_log_evidence_margin: float = 1.0
-    injection_share: float = 0.25
-
-    def __post_init__(self) -> None:
-        if self.resampler not in RESAMPLERS:
-            raise SkyfixError(f"resampler: expected one of {', '.join(RESAMPLERS)}, got {self.resampler!r}")
-        for name in ("ess_fraction", "regularisation"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise SkyfixError(f"{name}: expected in [0, 1], got {getattr(self, name)}")
-        for name in ("outlier_probability", "kidnap_probability", "recovery_probability"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise SkyfixError(f"{name}: expected in (0, 1), got {getattr(self, name)}")
-        if not 0.0 <= self.injection_share < 1.0:
-            raise SkyfixError(f"injection_share: expected in [0, 1), got {self.injection_share}")
-        if not np.isfinite(self.collapse_log_evidence_margin):
-            raise SkyfixError(
-                f"collapse_log_evidence_margin: expected a number, got {self.collapse_log_evidence_margin}"
-            )
+__all__ = ["ParticleFilter", "ParticleFilterSettings"]
 
 
 class ParticleFilter:
@@ -125,9 +73,11 @@ class ParticleFilter:
         cloud[:, 2] = se2.wrap(cloud[:, 2])
         self.settings = settings or ParticleFilterSettings()
         self._rng = np.random.default_rng(seed)
-        self._particles = cloud
-        self._log_weights = weights - logsumexp(weights)
+        key = self._rng.integers(2**32, size=4, dtype=np.uint32)
+        self._cloud = Cloud(cloud, None if log_weights is None else weights, key, self.settings.threads)
+        self._lost_model = LostModel(self.settings.kidnap_probability, self.settings.recovery_probability)
         self._log_evidence = 0.0
+        self._travelled_m = self._turned_rad = inf  # since the last measurement that counted: the first one does
         self._lost = self.settings.kidnap_probability
 
     @classmethod
@@ -142,15 +92,28 @@ class ParticleFilter:
         rng = np.random.default_rng(seed)
         return cls(prior.sample(count, rng), rng, settings)
 
+    @classmethod
+    def from_map(
+        cls,
+        grid: MapGrid,
+        count: int,
+        seed: int | np.random.Generator,
+        settings: ParticleFilterSettings | None = None,
+        allowed: ArrayLike | None = None,
+    ) -> Self:
+        """A filter that knows nothing: `count` particles all over a map, stratified, see `fusion.map_start`."""
+        rng = np.random.default_rng(seed)
+        return cls(stratified_poses(grid, count, rng, allowed), rng, settings)
+
     @property
     def particles(self) -> FloatArray:
-        """Poses (N, 3), a read-only view."""
-        return read_only(self._particles)
+        """Poses (N, 3), read-only."""
+        return read_only(self._cloud.poses())
 
     @property
     def log_weights(self) -> FloatArray:
-        """Normalised log weights (N,), a read-only view."""
-        return read_only(self._log_weights)
+        """Normalised log weights (N,), read-only."""
+        return read_only(self._cloud.log_weights())
 
     @property
     def lost_score(self) -> float:
@@ -159,8 +122,10 @@ class ParticleFilter:
 
     def predict(self, increment: OdometryIncrement) -> None:
         """Move every particle by the increment plus noise of its covariance."""
-        noise = self._rng.standard_normal(self._particles.shape) @ matrix_root(increment.covariance).T
-        self._particles = se2.compose(self._particles, increment.delta + noise)
+        delta = increment.delta.tolist()
+        self._cloud.move(delta, increment.covariance.tolist())
+        self._travelled_m += hypot(delta[0], delta[1])
+        self._turned_rad += abs(delta[2])
 
     def update(self, likelihood: PoseLikelihood, temperature: float = 1.0) -> UpdateReport:
         """Weight the particles by a likelihood; resample and recover when needed.
@@ -178,47 +143,96 @@ class ParticleFilter:
             When the likelihood gives NaN or an infinity; the filter is then as it was before.
         """
         settings = self.settings
-        measurement = likelihood.tempered(temperature).with_outliers(settings.outlier_probability)
-        log_likelihood = np.asarray(measurement.log_density(self._particles), dtype=np.float64)
-        if log_likelihood.shape != self._log_weights.shape or not np.isfinite(log_likelihood).all():
-            raise SkyfixError(f"likelihood: expected {len(self._particles)} finite log densities, got others")
-
-        joint = self._log_weights + log_likelihood
-        log_evidence = float(logsumexp(joint))
-        log_odds = self._lost_log_odds(log_evidence - log_uniform_density(measurement.grid))
+        if self._travelled_m < settings.standstill_m and self._turned_rad < settings.standstill_rad:
+            size = self._cloud.moments().effective_sample_size
+            return UpdateReport(self._log_evidence, size, lost_score=self._lost, used=False)
+        log_uniform = log_uniform_evidence(likelihood, settings.outlier_probability)
+        self._log_evidence = log_evidence = self._weigh(likelihood, temperature)
+        self._travelled_m = self._turned_rad = 0.0
+        log_odds = self._lost_model.log_odds(self._lost, log_evidence, log_uniform)
+        self._lost = probability(log_odds)
+        size = self._cloud.moments().effective_sample_size
+        is_degenerate = size < settings.ess_fraction * len(self._cloud) or settings.adaptive is not None
+        count = self._next_count()
         is_collapsed = log_odds > settings.collapse_log_evidence_margin
-        count = len(self._particles)
         injected = min(round(settings.injection_share * count), count - 1) if is_collapsed else 0
-        fresh = measurement.sample(injected, self._rng) if injected else np.empty((0, 3))
-
-        self._log_evidence, self._lost = log_evidence, float(expit(log_odds))
-        self._log_weights = joint - log_evidence
-        size = effective_sample_size(self._log_weights)
-        is_degenerate = size < settings.ess_fraction * count
         if injected or is_degenerate:
             self._resample(count - injected)
         if injected:
-            self._particles = np.concatenate([self._particles, fresh])
-            of_the_fresh = np.full(injected, np.log(self._lost) - np.log(injected))
-            self._log_weights = np.concatenate([self._log_weights + np.log1p(-self._lost), of_the_fresh])
+            measurement = likelihood.tempered(temperature).with_outliers(settings.outlier_probability)
+            self._inject(measurement.sample(injected, self._rng))
         return UpdateReport(log_evidence, size, bool(injected or is_degenerate), injected, self._lost)
 
     def estimate(self, stamp_ns: int, max_modes: int = 0) -> Estimate:
-        """Summary of the cloud; with its `max_modes` heaviest clusters when that is not 0."""
-        weights = np.exp(self._log_weights)
-        pose, covariance = se2.weighted_mean_and_covariance(self._particles, weights)
-        modes = find_clusters(self._particles, weights).mixture(max_modes) if max_modes else None
-        size = effective_sample_size(self._log_weights)
-        covariance = covariance + VARIANCE_FLOOR
+        """Summary of the cloud; with its `max_modes` heaviest clusters when that is not 0.
+
+        The covariance is the unbiased one of a weighted sample: that of the cloud times ``1 / (1 - sum w^2)``, which
+        is ``ESS / (ESS - 1)``, at most 2; and never less than 1 mm and 0.1 mrad.
+        """
+        moments, modes = self._cloud.moments(), None
+        if max_modes:
+            modes = find_clusters(self._cloud.poses(), np.exp(self._cloud.log_weights())).mixture(max_modes)
+        x, y, yaw = moments.mean
+        pose = np.array((x + self._cloud.anchor[0], y + self._cloud.anchor[1], yaw))
+        size = moments.effective_sample_size
+        covariance = positive_definite(moments.covariance, size / (size - 1.0) if size > 2.0 else 2.0)
         return Estimate(stamp_ns, pose, covariance, modes, size, self._log_evidence, self._lost)
 
-    def _lost_log_odds(self, log_ratio: float) -> float:
-        """Log odds of being lost after a measurement with evidence ``exp(log_ratio)`` times that of a lost filter."""
-        stays = self._lost * (1.0 - self.settings.recovery_probability)
-        return float(logit(stays + (1.0 - self._lost) * self.settings.kidnap_probability) - log_ratio)
+    def most_likely_pose(self) -> FloatArray:
+        """The particle (3,) where the cloud is densest, by a kernel estimate: a mode; the mean may lie between two."""
+        poses = self._cloud.poses()
+        density = LatticeDensity.of(poses, self._cloud.log_weights()).log_density(poses)
+        return poses[int(np.argmax(density))]
+
+    def _weigh(self, likelihood: PoseLikelihood, temperature: float) -> float:
+        """Weigh the cloud, in one pass when the likelihood can be looked up, and give the log evidence."""
+        checked_temperature(temperature)
+        if self.settings.guided_share > 0.0:
+            return self._weigh_guided(likelihood.tempered(temperature).with_outliers(self.settings.outlier_probability))
+        mixture = likelihood.with_outliers(self.settings.outlier_probability)
+        lookup = lookup_of(mixture.likelihood, temperature) if isinstance(mixture, OutlierMixture) else None
+        if isinstance(mixture, OutlierMixture) and lookup is not None:
+            return self._cloud.weigh(lookup, mixture.probability)
+        measurement = likelihood.tempered(temperature).with_outliers(self.settings.outlier_probability)
+        log_likelihood = np.asarray(measurement.log_density(self._cloud.poses()), dtype=np.float64)
+        if log_likelihood.shape != (len(self._cloud),) or not np.isfinite(log_likelihood).all():
+            raise SkyfixError(f"likelihood: expected {len(self._cloud)} finite log densities, got others")
+        return self._cloud.add_log_likelihood(log_likelihood)
+
+    def _weigh_guided(self, measurement: PoseLikelihood) -> float:
+        """Replace the prediction by draws from it and from the measurement, weighed; the log evidence."""
+        predicted = LatticeDensity.of(self._cloud.poses(), self._cloud.log_weights())
+        count = len(self._cloud)
+        poses, log_weights = guided(predicted, measurement, count, self.settings.guided_share, self._rng)
+        if not np.isfinite(log_weights).all():
+            raise SkyfixError(f"likelihood: expected {count} finite log densities, got others")
+        self._cloud.replace(poses, log_weights)
+        largest = log_weights.max()
+        return float(largest + np.log(np.exp(log_weights - largest).mean()))
+
+    def _next_count(self) -> int:
+        """How many particles the cloud is to have after this measurement."""
+        if self.settings.adaptive is None:
+            return len(self._cloud)
+        return self.settings.adaptive.count(self._cloud.poses(), np.exp(self._cloud.log_weights()), self._rng)
 
     def _resample(self, count: int) -> None:
         """Replace the cloud by `count` equally weighted particles."""
-        chosen = RESAMPLERS[self.settings.resampler](np.exp(self._log_weights), count, self._rng)
-        self._particles = regularised(self._particles[chosen], self.settings.regularisation, self._rng)
-        self._log_weights = np.full(count, -np.log(count))
+        cloud, scale, moments = self._cloud, self.settings.regularisation, self._cloud.moments()
+        if self.settings.resampler == "systematic":
+            cloud.resample(count, self._rng.random())
+        else:
+            weights = np.exp(cloud.log_weights())
+            cloud.keep(RESAMPLERS[self.settings.resampler](weights, count, self._rng).astype(np.int32))
+        if scale > 0.0:
+            if is_compact(moments.covariance):
+                cloud.regularise(scale * silverman_bandwidth(count, 3))
+            else:
+                cloud.replace(regularised(cloud.poses(), scale, self._rng), None)
+
+    def _inject(self, fresh: FloatArray) -> None:
+        """Add particles (n, 3) that have the weight of being lost together."""
+        kept = self._cloud.poses()
+        weights = np.full(len(kept) + len(fresh), np.log1p(-self._lost) - np.log(len(kept)))
+        weights[len(kept) :] = np.log(self._lost) - np.log(len(fresh))
+        self._cloud.replace(np.concatenate([kept, fresh]), weights)

@@ -24,6 +24,9 @@ class UpdateReport:
         Number of particles drawn from the likelihood.
     lost_score : float
         Probability of being lost after this measurement; 0 where a filter has no such model.
+    used : bool
+        Whether the measurement counted; a filter may leave one out that it took while standing still. The other
+        numbers are then those of the last one that did.
     """
 
     log_evidence: float
@@ -31,6 +34,7 @@ class UpdateReport:
     resampled: bool = False
     injected: int = 0
     lost_score: float = 0.0
+    used: bool = True
 
 
 class PoseFilter(Protocol):

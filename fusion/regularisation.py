@@ -10,11 +10,15 @@ Source: Liu, West, "Combined parameter and state estimation in simulation-based 
 Silverman, "Density estimation for statistics and data analysis", 1986, equation 4.14.
 """
 
+from typing import TypeVar
+
 import numpy as np
 
 from fusion import se2
 from fusion.arrays import FloatArray
-from fusion.clusters import find_clusters
+from fusion.clusters import CELL_M, CELL_RAD, find_clusters
+
+FloatOrArray = TypeVar("FloatOrArray", float, FloatArray)
 
 
 def matrix_root(covariance: FloatArray) -> FloatArray:
@@ -23,9 +27,14 @@ def matrix_root(covariance: FloatArray) -> FloatArray:
     return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
 
 
-def silverman_bandwidth(count: FloatArray, dimensions: int) -> FloatArray:
+def silverman_bandwidth(count: FloatOrArray, dimensions: int) -> FloatOrArray:
     """Kernel width, in standard deviations, for a Gaussian sample of `count` points."""
     return (4.0 / (count * (dimensions + 2.0))) ** (1.0 / (dimensions + 4.0))
+
+
+def is_compact(covariance: list[list[float]]) -> bool:
+    """Whether a cloud is narrow enough to be one cluster: its spread less than a cell of `fusion.clusters`."""
+    return max(covariance[0][0], covariance[1][1]) < CELL_M**2 and covariance[2][2] < CELL_RAD**2
 
 
 def regularised(particles: FloatArray, scale: float, rng: np.random.Generator) -> FloatArray:

@@ -1,0 +1,332 @@
+"""A cloud of weighted particles as the compiled step keeps it: float32, relative to an anchor, moved when asked for.
+
+Moving, resampling and its kernel noise are written down when they are ordered and carried out by the next pass over
+the particles, which is that of the next measurement, or of whoever looks at the cloud. The random numbers depend on
+the key, on the number of the order and on the particle, so looking changes nothing.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise
+from math import cos, log, pi, remainder, sin, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.arrays import Float32Array, FloatArray
+from fusion.clusters import VARIANCE_FLOOR
+from fusion.kernels_resample import block_masses, share_out, spread_blocks
+from fusion.kernels_step import (
+    BLOCK,
+    CENTRE,
+    DELTA,
+    KERNEL_ON,
+    KERNEL_ROOT,
+    LOG_SHIFT,
+    LOOKUP_SIZE,
+    MOTION_SIZE,
+    MOVED,
+    NOTHING,
+    REFERENCE_X,
+    ROOT,
+    SHIFT,
+    SHRINK,
+    SUMS,
+    combined,
+    step_blocks,
+)
+from fusion.lookup import NO_SLOTS, NO_TABLE, Lookup
+
+_REACH_M = 64.0  # the anchor follows the cloud when its mean is farther away
+_NOBODY = np.zeros(0, np.int32)
+_STAY = np.zeros(0)
+_NO_SHAPE = np.zeros(5, np.int64)
+_EQUAL = np.zeros(0)
+_ROUNDING = 1e-14
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="skyfix")
+
+
+def lower_root(covariance: list[list[float]]) -> list[float]:
+    """Lower triangular L, row by row (9,), with ``L L^T = covariance``; positive semidefinite will do."""
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance
+    a = sqrt(xx) if xx > 0.0 else 0.0
+    b, c = (xy / a, xt / a) if a > 0.0 else (0.0, 0.0)
+    rest = yy - b * b
+    d = sqrt(rest) if rest > _ROUNDING * yy else 0.0
+    e = (yt - b * c) / d if d > 0.0 else 0.0
+    rest = tt - c * c - e * e
+    return [a, 0.0, 0.0, b, d, 0.0, c, e, sqrt(rest) if rest > _ROUNDING * tt else 0.0]
+
+
+def positive_definite(covariance: list[list[float]], factor: float) -> FloatArray:
+    """A covariance (3, 3) times a factor, plus 1 mm and 0.1 mrad squared; rounding below zero is taken away."""
+    result = np.array(covariance) * factor + VARIANCE_FLOOR
+    root = lower_root(result.tolist())
+    if min(root[0], root[4], root[8]) > 0.0:
+        return result
+    values, vectors = np.linalg.eigh(result)
+    return (vectors * np.maximum(values, VARIANCE_FLOOR[2, 2])) @ vectors.T
+
+
+def _wrapped(angle: float) -> float:
+    return angle if -pi <= angle < pi else remainder(angle, 2.0 * pi) if remainder(angle, 2.0 * pi) < pi else -pi
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Sums over a weighted cloud.
+
+    Parameters
+    ----------
+    effective_sample_size : float
+        ``(sum w)^2 / sum w^2``.
+    mean : tuple of 3 floats
+        x, y relative to the anchor, yaw wrapped and circular.
+    covariance : list of 3 lists of 3 floats
+        About the mean, without a correction for the sample's size.
+    """
+
+    effective_sample_size: float
+    mean: tuple[float, float, float]
+    covariance: list[list[float]]
+
+
+class Cloud:
+    """N weighted particles.
+
+    Parameters
+    ----------
+    poses : (N, 3) float64
+        x, y, yaw in the map frame, yaw wrapped.
+    log_weights : (N,) float64 or None
+        Up to a constant; None for equal ones.
+    key : (4,) uint32
+        Of the random numbers.
+    threads : int
+        How many share the work; the result does not depend on it.
+    """
+
+    def __init__(
+        self, poses: FloatArray, log_weights: FloatArray | None, key: NDArray[np.uint32], threads: int = 1
+    ) -> None:
+        self._key, self._threads, self._epoch = key, threads, 0
+        self._spare: dict[str, NDArray[Any]] = {}
+        self.replace(poses, log_weights)
+
+    def replace(self, poses: FloatArray, log_weights: FloatArray | None) -> None:
+        """Go on with other particles."""
+        centre = np.rint(poses[:, :2].mean(axis=0))
+        self._anchor = (float(centre[0]), float(centre[1]))
+        xyt = np.empty((3, len(poses)), np.float32)
+        xyt[:2] = (poses[:, :2] - centre).T
+        np.clip(poses[:, 2], -pi, pi, out=xyt[2], casting="same_kind")
+        self._xyt: Float32Array = xyt.reshape(-1)
+        self._count = len(poses)
+        self._log_weights = _EQUAL if log_weights is None else log_weights - log_weights.max()
+        self._shift = 0.0
+        self._ancestors = _NOBODY
+        self._motion: FloatArray | None = None
+        self._sums = np.zeros((0, SUMS))
+        self._reference = (0.0, 0.0, float(poses[0, 2]))
+        self._moments: Moments | None = self._pass(None, 0.0)
+        self._reference = self._moments.mean
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def anchor(self) -> tuple[float, float]:
+        """What positions are relative to."""
+        return self._anchor
+
+    def poses(self) -> FloatArray:
+        """Poses (N, 3) float64 in the map frame."""
+        self._settle()
+        xyt = self._xyt.reshape(3, -1).astype(np.float64)
+        xyt[0] += self._anchor[0]
+        xyt[1] += self._anchor[1]
+        np.copyto(xyt[2], -pi, where=(xyt[2] >= pi) | (xyt[2] < -pi))
+        return np.ascontiguousarray(xyt.T)
+
+    def log_weights(self) -> FloatArray:
+        """Normalised log weights (N,)."""
+        self._settle()
+        if len(self._log_weights) == 0:
+            return np.full(self._count, -log(self._count))
+        return self._log_weights - self._log_total
+
+    def moments(self) -> Moments:
+        """Moments of the prediction or of the posterior; resampling, which only adds noise, leaves them as they are."""
+        if self._moments is None:
+            self._settle()
+        assert self._moments is not None
+        return self._moments
+
+    def move(self, delta: list[float], covariance: list[list[float]]) -> None:
+        """Order a motion: an increment and its covariance, on the axes of every particle's body."""
+        if self._motion is not None and self._motion[MOVED] > 0.0:
+            self._settle()
+        motion = self._order()
+        motion[DELTA : DELTA + 3] = delta
+        motion[ROOT : ROOT + 9] = lower_root(covariance)
+        motion[MOVED] = 1.0
+        self._moments = None
+
+    def weigh(self, lookup: Lookup, outlier_probability: float) -> float:
+        """Carry out all orders, weigh by a likelihood and give the log evidence."""
+        before = self._log_total - self._shift
+        self._moments = self._pass(lookup, outlier_probability)
+        self._reference = self._moments.mean
+        return self._log_total - before
+
+    def add_log_likelihood(self, log_likelihood: FloatArray) -> float:
+        """Weigh by ln densities (N,) of the particles as they are now and give the log evidence."""
+        self._settle()
+        before = self._log_total - self._shift
+        known = self._log_weights if len(self._log_weights) else np.zeros(self._count)
+        self._log_weights = (known - self._shift) + log_likelihood
+        largest = self._shift = float(self._log_weights.max())
+        self._moments = self._pass(None, 0.0)
+        self._reference = self._moments.mean
+        return self._log_total + largest - before
+
+    def resample(self, count: int, offset: float) -> None:
+        """Order systematic resampling to `count` equally weighted particles."""
+        self._settle()
+        if len(self._log_weights) == 0:
+            self._log_weights = np.zeros(self._count)
+        blocks = len(self._sums)
+        masses, edges = np.empty(blocks), np.empty(blocks + 1)
+        ancestors = self._buffer("ancestors", count, np.int32)
+        self._share(block_masses, blocks, self._log_weights, self._sums, masses)
+        share_out(self._sums, masses, count, edges)
+        self._share(spread_blocks, blocks, self._log_weights, self._sums, masses, edges, offset, ancestors)
+        self.keep(ancestors)
+
+    def keep(self, ancestors: NDArray[np.int32]) -> None:
+        """Order the copies `ancestors` (n,) with equal weights in place of the cloud; they stand for its moments."""
+        self._settle()
+        if len(self._log_weights):
+            self._spare["log weights"] = self._log_weights
+        self._ancestors, self._count = ancestors, len(ancestors)
+        self._log_weights, self._shift, self._log_total = _EQUAL, 0.0, log(len(ancestors))
+        self._epoch += 1
+
+    def regularise(self, width: float) -> None:
+        """Order kernel noise of `width` standard deviations, with shrinkage, on top of resampling."""
+        moments, motion = self.moments(), self._order()
+        motion[CENTRE : CENTRE + 3] = moments.mean
+        motion[SHRINK] = sqrt(1.0 - width * width)
+        motion[KERNEL_ROOT : KERNEL_ROOT + 9] = [width * value for value in lower_root(moments.covariance)]
+        motion[KERNEL_ON] = 1.0
+
+    def _order(self) -> FloatArray:
+        if self._motion is None:
+            self._motion = np.zeros(MOTION_SIZE)
+        return self._motion
+
+    def _settle(self) -> None:
+        """Carry out what has been ordered."""
+        if self._motion is not None or len(self._ancestors):
+            moments = self._pass(None, 0.0)
+            if self._moments is None:
+                self._moments = moments
+
+    def _pass(self, lookup: Lookup | None, outlier_probability: float) -> Moments:
+        """Carry out the orders in one pass, weigh if there is a lookup, and give the moments."""
+        source, ancestors = self._xyt, self._ancestors
+        motion = self._order() if len(ancestors) else self._motion
+        cloud = source
+        if motion is not None:
+            self._go_on(motion)
+            cloud = self._buffer("cloud", 3 * self._count, np.float32)
+        out = self._buffer("log weights", self._count, np.float64)
+        look = np.zeros(LOOKUP_SIZE) if lookup is None else lookup.arguments(self._anchor, outlier_probability)
+        look[LOG_SHIFT] = self._shift
+        look[REFERENCE_X : REFERENCE_X + 3] = self._reference
+        self._step(source, ancestors, _STAY if motion is None else motion, cloud, lookup, look, out)
+        if motion is not None:
+            self._spare["cloud"], self._xyt = source, cloud
+            self._spare["ancestors"] = ancestors
+            self._epoch += motion[MOVED] > 0.0
+        self._ancestors, self._motion = _NOBODY, None
+        if lookup is not None or len(self._log_weights):
+            self._spare["log weights"], self._log_weights = self._log_weights, out
+        else:
+            self._spare["log weights"] = out
+        return self._summary(look)
+
+    def _go_on(self, motion: FloatArray) -> None:
+        """Move the reference pose along, and the anchor when the cloud has left it behind."""
+        x, y, yaw = self._reference
+        dx, dy, turn = motion[DELTA : DELTA + 3].tolist()
+        east, north = (float(round(at)) if abs(at) > _REACH_M else 0.0 for at in (x, y))
+        motion[SHIFT : SHIFT + 2] = east, north
+        self._anchor = (self._anchor[0] + east, self._anchor[1] + north)
+        along, across = cos(yaw), sin(yaw)
+        x, y = x - east + along * dx - across * dy, y - north + across * dx + along * dy
+        self._reference = (x, y, _wrapped(yaw + turn))
+        if self._moments is not None and (east or north):
+            x, y, yaw = self._moments.mean
+            self._moments = replace(self._moments, mean=(x - east, y - north, yaw))
+
+    def _step(
+        self,
+        source: Float32Array,
+        ancestors: NDArray[np.int32],
+        motion: FloatArray,
+        cloud: Float32Array,
+        lookup: Lookup | None,
+        look: FloatArray,
+        out: FloatArray,
+    ) -> None:
+        blocks = -(-self._count // BLOCK)
+        if len(self._sums) != blocks:
+            self._sums = np.zeros((blocks, SUMS))
+        weigh = (
+            (NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS, _NO_SHAPE)
+            if lookup is None
+            else (lookup.mode, lookup.table, lookup.location, lookup.slots, lookup.shape())
+        )
+        moved = (source, ancestors, motion, self._key, np.uint32(self._epoch), cloud)
+        self._share(step_blocks, blocks, *moved, *weigh, look, self._log_weights, out, self._sums)
+
+    def _summary(self, look: FloatArray) -> Moments:
+        """Moments from the sums; about the mean itself where the reference was too far from it to be accurate."""
+        x, y, yaw = look[REFERENCE_X : REFERENCE_X + 3].tolist()
+        sums = combined(self._sums, look).tolist()
+        far_off = (sums[3] - x) ** 2 > 1e3 * sums[6] or (sums[4] - y) ** 2 > 1e3 * sums[8]
+        if far_off or sums[12] + abs(sums[5] - yaw) >= pi - 1e-5:
+            look[REFERENCE_X : REFERENCE_X + 3] = sums[3], sums[4], _wrapped(sums[5])
+            look[LOG_SHIFT] = 0.0
+            out = self._log_weights if len(self._log_weights) else self._buffer("log weights", self._count, np.float64)
+            self._step(self._xyt, _NOBODY, _STAY, self._xyt, None, look, out)
+            if len(self._log_weights) == 0:
+                self._spare["log weights"] = out
+            sums = combined(self._sums, look).tolist()
+        largest, self._log_total, size, x, y, yaw, xx, xy, yy, xt, yt, tt, _ = sums
+        self._shift = largest if len(self._log_weights) else 0.0
+        return Moments(size, (x, y, _wrapped(yaw)), [[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+
+    def _buffer(self, name: str, size: int, kind: Any) -> NDArray[Any]:
+        """Memory that was used before, when it has the right size: fresh memory costs more than the step."""
+        spare = self._spare.pop(name, None)
+        return spare if spare is not None and len(spare) == size else np.empty(size, kind)
+
+    def _share(self, kernel: Any, blocks: int, *arguments: Any) -> None:
+        """Run a kernel over all blocks, on several threads when that pays."""
+        threads = min(self._threads, blocks // 4)
+        if threads <= 1:
+            kernel(0, blocks, *arguments)
+            return
+        edges = [blocks * part // threads for part in range(threads + 1)]
+        work = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in pairwise(edges[1:])]
+        kernel(edges[0], edges[1], *arguments)
+        for each in work:
+            each.result()

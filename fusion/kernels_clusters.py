@@ -1,0 +1,92 @@
+"""Connected components of occupied cells of position and heading, and the moments of each, compiled by numba."""
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+
+
+@numba.njit(**_OPTIONS)
+def cells_of(
+    poses: NDArray[np.float64], x0: float, y0: float, cell_m: float, cols: int, yaw_cells: int
+) -> NDArray[np.int64]:
+    """Cell of each pose (N, 3) in a grid of (rows, cols, yaw_cells) whose outermost rows and columns stay empty."""
+    cells = np.empty(len(poses), np.int64)
+    for i in range(len(poses)):
+        row = int((poses[i, 0] - x0) / cell_m) + 1
+        col = int((poses[i, 1] - y0) / cell_m) + 1
+        turns = poses[i, 2] / (2.0 * np.pi)
+        yaw = min(int((turns - np.floor(turns)) * yaw_cells), yaw_cells - 1)
+        cells[i] = (row * cols + col) * yaw_cells + yaw
+    return cells
+
+
+@numba.njit(**_OPTIONS)
+def components(cells: NDArray[np.int64], size: int, cols: int, yaw_cells: int) -> tuple[NDArray[np.int64], int]:
+    """Label (N,) of each occupied cell in a grid of `size` cells, corners and the seam joined; and how many."""
+    label_of = np.full(size, -1, np.int32)
+    for cell in cells:
+        label_of[cell] = -2  # occupied, not yet reached
+    waiting = np.empty(min(len(cells), size), np.int64)
+    count = 0
+    for start in cells:
+        if label_of[start] != -2:
+            continue
+        label_of[start] = count
+        waiting[0] = start
+        left = 1
+        while left > 0:
+            left -= 1
+            place, yaw = divmod(waiting[left], yaw_cells)
+            for drow in range(-1, 2):
+                for dcol in range(-1, 2):
+                    base = (place + drow * cols + dcol) * yaw_cells
+                    for dyaw in range(-1, 2):
+                        near = base + (yaw + dyaw) % yaw_cells
+                        if label_of[near] == -2:
+                            label_of[near] = count
+                            waiting[left] = near
+                            left += 1
+        count += 1
+    labels = np.empty(len(cells), np.int64)
+    for i in range(len(cells)):
+        labels[i] = label_of[cells[i]]
+    return labels, count
+
+
+@numba.njit(**_OPTIONS)
+def moments_of(
+    poses: NDArray[np.float64], weights: NDArray[np.float64], labels: NDArray[np.int64], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Mass (M,), mean (M, 3) and covariance (M, 3, 3) of each cluster; one without weight gets equal weights."""
+    mass, scale = np.zeros(count), np.zeros(count)
+    for i in range(len(poses)):
+        mass[labels[i]] += weights[i]
+    for i in range(len(poses)):
+        scale[labels[i]] += weights[i] if mass[labels[i]] > 0.0 else 1.0
+    sums = np.zeros((count, 4))
+    for i in range(len(poses)):
+        m = labels[i]
+        share = (weights[i] if mass[m] > 0.0 else 1.0) / scale[m]
+        sums[m, 0] += share * poses[i, 0]
+        sums[m, 1] += share * poses[i, 1]
+        sums[m, 2] += share * np.cos(poses[i, 2])
+        sums[m, 3] += share * np.sin(poses[i, 2])
+    means, covariances = np.empty((count, 3)), np.zeros((count, 3, 3))
+    for m in range(count):
+        yaw = np.arctan2(sums[m, 3], sums[m, 2])
+        means[m, 0], means[m, 1], means[m, 2] = sums[m, 0], sums[m, 1], -np.pi if yaw >= np.pi else yaw
+    residual = np.empty(3)
+    for i in range(len(poses)):
+        m = labels[i]
+        share = (weights[i] if mass[m] > 0.0 else 1.0) / scale[m]
+        for axis in range(3):
+            residual[axis] = poses[i, axis] - means[m, axis]
+        residual[2] -= 2.0 * np.pi * np.floor((residual[2] + np.pi) / (2.0 * np.pi))
+        for a in range(3):
+            for b in range(3):
+                covariances[m, a, b] += share * residual[a] * residual[b]
+    return mass, means, covariances
