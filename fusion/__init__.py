@@ -13,7 +13,7 @@ from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
-from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.particle_filter import ParticleFilter, ParticleFilterSettings, ParticleFilterState
 from fusion.pose_filter import PoseFilter, UpdateReport
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
@@ -30,6 +30,7 @@ __all__ = [
     "OutlierMixture",
     "ParticleFilter",
     "ParticleFilterSettings",
+    "ParticleFilterState",
     "PoseFilter",
     "PoseLikelihood",
     "SkyfixError",

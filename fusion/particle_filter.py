@@ -16,6 +16,7 @@ never fire.
 Sources: Gordon, Salmond, Smith 1993; Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, 8.3.5 (augmented MCL).
 """
 
+import json
 from dataclasses import dataclass
 from typing import Self
 
@@ -91,6 +92,31 @@ class ParticleFilterSettings:
             )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ParticleFilterState:
+    """All that a particle filter knows at one time; with the same settings it continues bit for bit.
+
+    Parameters
+    ----------
+    particles : (N, 3) float64
+        Poses, map frame.
+    log_weights : (N,) float64
+        Normalised.
+    log_evidence : float
+        Of the last measurement.
+    lost_score : float
+        After the last measurement.
+    generator : str
+        State of the random generator, JSON.
+    """
+
+    particles: FloatArray
+    log_weights: FloatArray
+    log_evidence: float
+    lost_score: float
+    generator: str
+
+
 class ParticleFilter:
     """Weighted particles over (x, y, yaw) in the map frame.
 
@@ -141,6 +167,39 @@ class ParticleFilter:
         """A filter with `count` particles drawn from a prior."""
         rng = np.random.default_rng(seed)
         return cls(prior.sample(count, rng), rng, settings)
+
+    @classmethod
+    def from_state(cls, state: ParticleFilterState, settings: ParticleFilterSettings | None = None) -> Self:
+        """A filter that goes on from a state."""
+        restored = cls(state.particles, 0, settings, state.log_weights)
+        restored.restore(state)
+        return restored
+
+    def state(self) -> ParticleFilterState:
+        """A copy of all that the filter knows."""
+        generator = json.dumps(self._rng.bit_generator.state, default=np.ndarray.tolist)
+        particles, log_weights = read_only(self._particles.copy()), read_only(self._log_weights.copy())
+        return ParticleFilterState(particles, log_weights, self._log_evidence, self._lost, generator)
+
+    def restore(self, state: ParticleFilterState) -> None:
+        """Go back to a state of this filter, or of one with the same settings.
+
+        Raises
+        ------
+        SkyfixError
+            When shapes disagree, a value is not finite, or the generator is unknown; the filter is then as it was.
+        """
+        particles = checked("particles", state.particles, ("N", 3)).copy()
+        log_weights = checked("log weights", state.log_weights, (len(particles),)).copy()
+        if len(particles) == 0 or not 0.0 <= state.lost_score <= 1.0 or not np.isfinite(state.log_evidence):
+            raise SkyfixError(f"filter state: expected particles and finite numbers, got {len(particles)} particles")
+        self._rng = _generator(state.generator)
+        self._particles, self._log_weights = particles, log_weights
+        self._log_evidence, self._lost = state.log_evidence, state.lost_score
+
+    def reseed(self, key: int) -> None:
+        """Draw all further randomness from a generator started with `key`, a non-negative integer."""
+        self._rng = np.random.default_rng(key)
 
     @property
     def particles(self) -> FloatArray:
@@ -222,3 +281,14 @@ class ParticleFilter:
         chosen = RESAMPLERS[self.settings.resampler](np.exp(self._log_weights), count, self._rng)
         self._particles = regularised(self._particles[chosen], self.settings.regularisation, self._rng)
         self._log_weights = np.full(count, -np.log(count))
+
+
+def _generator(state: str) -> np.random.Generator:
+    """The random generator of a state, JSON."""
+    try:
+        fields = json.loads(state)
+        generator = np.random.Generator(getattr(np.random, fields["bit_generator"])())
+        generator.bit_generator.state = fields
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SkyfixError(f"filter state: expected the state of a random generator, got {state[:40]!r}") from error
+    return generator
