@@ -13,29 +13,43 @@ from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
+from fusion.odometry_limits import MotionKind, OdometryLimits
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings, ParticleFilterState
 from fusion.pose_filter import PoseFilter, UpdateReport
 from fusion.prior import UniformPrior
+from fusion.resumable import ResumableFilter
+from fusion.tracker import Tracker
+from fusion.tracker_report import Arrival, Measured, Outcome, Statistics
+from fusion.tracker_settings import TrackerSettings
 from fusion.trajectory import Trajectory
 
 __all__ = [
+    "Arrival",
     "Estimate",
     "GaussianLikelihood",
     "GaussianMixture",
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
+    "Measured",
+    "MotionKind",
     "OdometryIncrement",
+    "OdometryLimits",
     "OdometryNoise",
+    "Outcome",
     "OutlierMixture",
     "ParticleFilter",
     "ParticleFilterSettings",
     "ParticleFilterState",
     "PoseFilter",
     "PoseLikelihood",
+    "ResumableFilter",
     "SkyfixError",
     "SmootherResult",
     "SmootherSettings",
+    "Statistics",
+    "Tracker",
+    "TrackerSettings",
     "Trajectory",
     "UniformPrior",
     "UpdateReport",
