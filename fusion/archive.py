@@ -37,7 +37,8 @@ def write_archive(path: str | Path, tree: Tree) -> None:
     try:
         with zipfile.ZipFile(draft, "w") as archive:
             for name, array in arrays.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                undated = zipfile.ZipInfo(f"{name}.npy")  # the same tree, the same bytes
+                with archive.open(undated, "w", force_zip64=True) as entry:
                     np.lib.format.write_array(entry, array, allow_pickle=False)
         draft.replace(path)
     except OSError as error:

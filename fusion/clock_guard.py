@@ -5,8 +5,8 @@ too late for ever. So samples outside the window are looked at together: a run o
 and no sample from inside the window among them, says that this is the clock now.
 
 - Ahead: believed after a number of samples, which are then used. They are withheld until then.
-- Behind: each is too late as it comes. Believed when the run is longer than the window, which messages that are merely
-  late are not; then the run is used.
+- Behind: each is too late as it comes. Believed when the run is longer than the window and half as dense as the
+  odometry in it, which messages that are merely late are not; then the run is used.
 """
 
 from enum import Enum
@@ -61,12 +61,13 @@ class ClockGuard:
         self._run.append(sample)
         return given_up
 
-    def believed(self) -> list[OdometrySample]:
-        """The run, ended, when it is long enough; else nothing."""
+    def believed(self, window_count: int) -> list[OdometrySample]:
+        """The run, ended, when it is long enough for a window of so many samples; else nothing."""
         if self._side is Side.AHEAD:
             is_long = len(self._run) >= self._samples
         else:
-            is_long = bool(self._run) and self._run[-1].stamp_ns - self._run[0].stamp_ns > self._history_ns
+            is_dense = len(self._run) > 1 and 2 * len(self._run) >= window_count
+            is_long = is_dense and self._run[-1].stamp_ns - self._run[0].stamp_ns > self._history_ns
         run = self._run if is_long else []
         if is_long:
             self.clear()

@@ -264,7 +264,7 @@ class Tracker:
         """A sample from outside the window: alone it is nothing, in a long enough run it is a clock that jumped."""
         self._counts["dismissed_odometry"] += self._guard.add(sample, side)
         self._counts["too_late_odometry"] += side is Side.BEHIND
-        run = self._guard.believed()
+        run = self._guard.believed(len(self._timeline.odometry))
         if not run:
             return Arrival(sample.stamp_ns, Outcome.TOO_LATE if side is Side.BEHIND else Outcome.WITHHELD)
         lost: list[int] = []
