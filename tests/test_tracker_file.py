@@ -54,7 +54,7 @@ def awkward_streams() -> list[Message]:
     return [*messages, *(Message(START + 9 * SECOND + i, odometry_at(START + 3 * SECOND + i)) for i in range(4))]
 
 
-@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, len(awkward_streams())))
 def test_a_saved_tracker_goes_on_bit_for_bit_wherever_it_was_cut(tmp_path, cut):
     messages = awkward_streams()
@@ -144,7 +144,7 @@ def test_a_likelihood_of_an_unknown_type_cannot_be_saved_and_the_old_file_stays(
     one.save(path)
     before = path.read_bytes()
     one.add_likelihood(START, OwnLikelihood())
-    with pytest.raises(SkyfixError, match="likelihood: expected one of GaussianLikelihood, .* to write, got OwnLike"):
+    with pytest.raises(SkyfixError, match=r"likelihood: expected one of GaussianLikelihood, .* to write, got OwnLike"):
         one.save(path)
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["tracker.npz"]
