@@ -18,7 +18,7 @@ from fusion.errors import SkyfixError
 Tree: TypeAlias = bool | int | float | str | NDArray[Any] | list["Tree"] | dict[str, "Tree"] | None
 
 _JSON = "json"
-_ARRAY = "array"
+_ARRAY = "$array"  # the key of a reference to an array; no key of a tree
 
 
 def write_archive(path: str | Path, tree: Tree) -> None:
@@ -55,8 +55,8 @@ def read_archive(path: str | Path) -> Any:
         When the file is not there or was not written by `write_archive`.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return _unpacked(json.loads(file[_JSON].tobytes().decode()), file)
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return _unpacked(json.loads(arrays[_JSON].tobytes().decode()), arrays)
     except OSError as error:
         raise SkyfixError(f"{path}: expected a saved file, got {error.strerror or error}") from error
     except (ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
@@ -67,10 +67,12 @@ def _packed(tree: Tree, arrays: dict[str, NDArray[Any]]) -> Any:
     if isinstance(tree, np.ndarray):
         if tree.dtype.hasobject:
             raise SkyfixError(f"archive: expected arrays of numbers, got {tree.dtype}")
-        name = f"{_ARRAY}{len(arrays)}"
+        name = f"array{len(arrays)}"
         arrays[name] = tree
         return {_ARRAY: name}
     if isinstance(tree, dict):
+        if _ARRAY in tree:
+            raise SkyfixError(f"archive: expected keys other than {_ARRAY}, got it")
         return {key: _packed(value, arrays) for key, value in tree.items()}
     if isinstance(tree, list):
         return [_packed(value, arrays) for value in tree]

@@ -34,18 +34,17 @@ def tracker(particles: int = 300, seed: int = 0, **changed: float) -> Tracker:
 
 
 def test_it_follows_a_drive_whose_odometry_drifts():
-    """Mean NEES over 6 drives at 5 times each; 3 degrees of freedom, correlated, so the band is wide."""
-    errors, covariances, drift = [], [], []
-    for seed in range(6):
+    """Mean NEES over 5 drives at 4 times each; 3 degrees of freedom, correlated, so the band is wide."""
+    errors, covariances = [], []
+    for seed in range(5):
         one = tracker(seed=seed)
-        for message in streams(15.0, hertz=10.0, seed=seed):
+        for message in streams(12.0, hertz=10.0, seed=seed):
             feed(one, [message])
             if message.is_odometry and message.stamp_ns >= at(5.0) and (message.stamp_ns - START) % (2 * SECOND) == 0:
                 estimate, truth = one.estimate(), truth_at(message.stamp_ns)
                 residual = estimate.pose - truth
                 errors.append(np.append(residual[:2], se2.wrap(residual[2])))
                 covariances.append(estimate.covariance)
-        drift.append(np.linalg.norm(odometry_at(at(14.0))[:2] - odometry_at(START)[:2]))
     errors = np.array(errors)
     assert np.linalg.norm(errors[:, :2], axis=1).mean() < 0.5
     assert 1.5 < nees(errors, np.array(covariances)).mean() < 5.0

@@ -214,3 +214,5 @@ def test_numbers_and_arrays_come_back_from_an_archive_bit_for_bit(tmp_path):
     assert back["nested"][1][0].dtype == np.float32
     assert back["nested"][1][1:] == [None, True, "ü"]
     assert zipfile.is_zipfile(tmp_path / "tree")
+    with pytest.raises(SkyfixError, match=r"archive: expected keys other than \$array"):
+        write_archive(tmp_path / "tree", {"$array": 1})
