@@ -1,8 +1,8 @@
 """Odometry from outside the window: a stray message, or a clock that has jumped?
 
 A stamp far ahead would push everything else out of the window, and a clock that was set back would leave everything
-too late for ever. So samples outside the window are looked at together: a run of them, each later than the one before
-and no sample from inside the window among them, says that this is the clock now.
+too late for ever. So samples outside the window are looked at together: a run of them, each within a window's length
+of the newest in the run and none from inside the window among them, says that this is the clock now.
 
 - Ahead: believed after a number of samples, which are then used. They are withheld until then.
 - Behind: each is too late as it comes. Believed when the run is longer than the window and half as dense as the
@@ -53,22 +53,24 @@ class ClockGuard:
     def add(self, sample: OdometrySample, side: Side) -> int:
         """Go on with the run, or begin a new one; says how many withheld samples that gave up."""
         given_up = 0
-        if self._run and side is self._side and sample.stamp_ns == self._run[-1].stamp_ns:
+        if side is self._side and any(sample.stamp_ns == other.stamp_ns for other in self._run):
             return 0
-        if side is not self._side or not 0 < sample.stamp_ns - self._run[-1].stamp_ns <= self._history_ns:
+        newest_ns = max((other.stamp_ns for other in self._run), default=sample.stamp_ns)
+        if side is not self._side or abs(sample.stamp_ns - newest_ns) > self._history_ns:
             given_up = self.clear()
         self._side = side
         self._run.append(sample)
         return given_up
 
     def believed(self, window_count: int) -> list[OdometrySample]:
-        """The run, ended, when it is long enough for a window of so many samples; else nothing."""
+        """The run in order of time, ended, when it is long enough for a window of so many samples; else nothing."""
         if self._side is Side.AHEAD:
             is_long = len(self._run) >= self._samples
         else:
             is_dense = len(self._run) > 1 and 2 * len(self._run) >= window_count
-            is_long = is_dense and self._run[-1].stamp_ns - self._run[0].stamp_ns > self._history_ns
-        run = self._run if is_long else []
+            stamps = [sample.stamp_ns for sample in self._run]
+            is_long = is_dense and max(stamps) - min(stamps) > self._history_ns
+        run = sorted(self._run, key=lambda sample: sample.stamp_ns) if is_long else []
         if is_long:
             self.clear()
         return run

@@ -17,6 +17,7 @@ from made_streams import (
     feed,
     measurement,
     odometry_at,
+    shuffled,
     streams,
     truth_at,
 )
@@ -232,13 +233,17 @@ def test_a_stray_stamp_far_ahead_is_dismissed():
     np.testing.assert_array_equal(answers(strayed, at_ns), answers(clean, at_ns))
 
 
+@pytest.mark.parametrize("is_shuffled", [False, True])
 @pytest.mark.parametrize("by_ns", [HOUR, 30 * SECOND, -30 * SECOND, -HOUR])
-def test_a_clock_that_jumps_is_followed(by_ns):
+def test_a_clock_that_jumps_is_followed(by_ns, is_shuffled):
     messages = streams(9.0)
+    delays = np.random.default_rng(0).integers(0, 200, len(messages)) * is_shuffled
+    first, then = [m for m in messages if m.stamp_ns <= at(3.0)], [m for m in messages if m.stamp_ns > at(3.0)]
+    then = shuffled([m.moved(by_ns) for m in then], delays[len(first) :])
     one = tracker()
-    arrivals = feed(one, [m.moved(by_ns) if m.stamp_ns > at(3.0) else m for m in messages])
+    arrivals = feed(one, [*shuffled(first, delays[: len(first)]), *then])
     assert one.statistics.clock_jumps == 1
-    assert one.newest_ns == at(9.0) + by_ns
+    assert one.newest_ns == max(m.stamp_ns for m in then)
     assert error_m(one, truth_ns=at(9.0)) < 1.2
     assert arrivals[-1].outcome is Outcome.USED
     assert sum(a.outcome is Outcome.WITHHELD for a in arrivals) == (4 if by_ns > 0 else 0)
