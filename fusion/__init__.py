@@ -29,17 +29,23 @@ from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
 from fusion.odometry_calibration import OdometryCalibration, calibrate_odometry
-from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.odometry_limits import MotionKind, OdometryLimits
+from fusion.particle_filter import ParticleFilter, ParticleFilterSettings, ParticleFilterState
 from fusion.particle_smoother import ParticleSmootherSettings, PathSamples, sample_paths
 from fusion.pose_filter import PoseFilter, UpdateReport
 from fusion.pose_lattice import PoseLattice
 from fusion.prior import UniformPrior
+from fusion.resumable import ResumableFilter
+from fusion.tracker import Tracker
+from fusion.tracker_report import Arrival, Measured, Outcome, Statistics
+from fusion.tracker_settings import TrackerSettings
 from fusion.trajectory import Trajectory
 
 __all__ = [
     "FG2_KITTI_SAME_AREA",
     "ORIENTERNET_KITTI_SEQUENTIAL",
     "TRANSLOCNET_KITTI",
+    "Arrival",
     "CloudHistory",
     "EmulatedLikelihood",
     "EmulatorSettings",
@@ -58,12 +64,17 @@ __all__ = [
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
+    "Measured",
+    "MotionKind",
     "OdometryCalibration",
     "OdometryIncrement",
+    "OdometryLimits",
     "OdometryNoise",
+    "Outcome",
     "OutlierMixture",
     "ParticleFilter",
     "ParticleFilterSettings",
+    "ParticleFilterState",
     "ParticleSmootherSettings",
     "PathSamples",
     "PoseFilter",
@@ -71,9 +82,13 @@ __all__ = [
     "PoseLikelihood",
     "PublishedFigures",
     "RecordedCloud",
+    "ResumableFilter",
     "SkyfixError",
     "SmootherResult",
     "SmootherSettings",
+    "Statistics",
+    "Tracker",
+    "TrackerSettings",
     "Trajectory",
     "UniformPrior",
     "UpdateReport",

@@ -119,9 +119,11 @@ class Cloud:
         self._spare: dict[str, NDArray[Any]] = {}
         self.replace(poses, log_weights)
 
-    def replace(self, poses: FloatArray, log_weights: FloatArray | None) -> None:
-        """Go on with other particles."""
-        centre = np.rint(poses[:, :2].mean(axis=0))
+    def replace(
+        self, poses: FloatArray, log_weights: FloatArray | None, anchor: tuple[float, float] | None = None
+    ) -> None:
+        """Go on with other particles, relative to an anchor or to where they are."""
+        centre = np.rint(poses[:, :2].mean(axis=0)) if anchor is None else np.array(anchor)
         self._anchor = (float(centre[0]), float(centre[1]))
         xyt = np.empty((3, len(poses)), np.float32)
         xyt[:2] = (poses[:, :2] - centre).T
@@ -137,8 +139,30 @@ class Cloud:
         self._moments: Moments | None = self._pass(None, 0.0)
         self._reference = self._moments.mean
 
+    def resume(self, poses: FloatArray, log_weights: FloatArray, anchor: FloatArray, moments: Moments) -> None:
+        """Go on with particles that stand for given moments, as a cloud that was resampled stands for its own."""
+        x, y = anchor.tolist()
+        is_equal = bool((log_weights == log_weights[0]).all())
+        self.replace(poses, None if is_equal else log_weights, (x, y))
+        self._moments = moments
+
+    def rekey(self, key: NDArray[np.uint32], epoch: int = 0) -> None:
+        """Draw what is ordered from here on with another key."""
+        self._settle()
+        self._key, self._epoch = key, epoch
+
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def key(self) -> NDArray[np.uint32]:
+        """Of the random numbers."""
+        return self._key
+
+    @property
+    def epoch(self) -> int:
+        """Number of orders that have used the key."""
+        return self._epoch
 
     @property
     def anchor(self) -> tuple[float, float]:

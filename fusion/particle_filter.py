@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike
 
 from fusion import se2
 from fusion.arrays import FloatArray, checked, read_only
-from fusion.cloud import Cloud, positive_definite
+from fusion.cloud import Cloud, Moments, positive_definite
 from fusion.clusters import find_clusters
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
+from fusion.filter_state import ParticleFilterState, generator_of, generator_state
 from fusion.grid import MapGrid
 from fusion.guided_proposal import guided
 from fusion.lattice_density import LatticeDensity
@@ -36,7 +37,7 @@ from fusion.prior import UniformPrior
 from fusion.regularisation import is_compact, regularised, silverman_bandwidth
 from fusion.resampling import RESAMPLERS
 
-__all__ = ["ParticleFilter", "ParticleFilterSettings"]
+__all__ = ["ParticleFilter", "ParticleFilterSettings", "ParticleFilterState"]
 
 
 class ParticleFilter:
@@ -104,6 +105,56 @@ class ParticleFilter:
         """A filter that knows nothing: `count` particles all over a map, stratified, see `fusion.map_start`."""
         rng = np.random.default_rng(seed)
         return cls(stratified_poses(grid, count, rng, allowed), rng, settings)
+
+    @classmethod
+    def from_state(cls, state: ParticleFilterState, settings: ParticleFilterSettings | None = None) -> Self:
+        """A filter that goes on from a state."""
+        restored = cls(state.particles, 0, settings, state.log_weights)
+        restored.restore(state)
+        return restored
+
+    def state(self) -> ParticleFilterState:
+        """A copy of all that the filter knows; it goes on from there itself, so that a restored one does the same."""
+        cloud = self._cloud
+        moments = cloud.moments()
+        state = ParticleFilterState(
+            particles=read_only(cloud.poses()),
+            log_weights=read_only(cloud.log_weights()),
+            anchor=read_only(np.array(cloud.anchor)),
+            mean=read_only(np.array(moments.mean)),
+            covariance=read_only(np.array(moments.covariance)),
+            effective_sample_size=moments.effective_sample_size,
+            log_evidence=self._log_evidence,
+            lost_score=self._lost,
+            moved=read_only(np.array([self._travelled_m, self._turned_rad])),
+            key=read_only(cloud.key),
+            epoch=cloud.epoch,
+            generator=generator_state(self._rng),
+        )
+        self.restore(state)
+        return state
+
+    def restore(self, state: ParticleFilterState) -> None:
+        """Go back to a state of this filter, or of one with the same settings.
+
+        Raises
+        ------
+        SkyfixError
+            When shapes disagree, a value is not finite, or the generator is unknown; the filter is then as it was.
+        """
+        state.check()
+        self._rng = generator_of(state.generator)
+        x, y, yaw = state.mean.tolist()
+        moments = Moments(state.effective_sample_size, (x, y, yaw), state.covariance.tolist())
+        self._cloud.resume(state.particles, state.log_weights, state.anchor, moments)
+        self._cloud.rekey(state.key.astype(np.uint32), state.epoch)
+        self._log_evidence, self._lost = state.log_evidence, state.lost_score
+        self._travelled_m, self._turned_rad = state.moved.tolist()
+
+    def reseed(self, key: int) -> None:
+        """Draw all further randomness from a generator started with `key`, a non-negative integer."""
+        self._rng = np.random.default_rng(key)
+        self._cloud.rekey(self._rng.integers(2**32, size=4, dtype=np.uint32))
 
     @property
     def particles(self) -> FloatArray:

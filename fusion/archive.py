@@ -1,0 +1,89 @@
+"""Trees of lists, dictionaries, numbers, strings and arrays in one file, exactly: npz with JSON inside, no pickle.
+
+Every array is an entry of the npz; JSON, itself an entry, holds the rest and names the arrays. Python writes floats so
+that they read back bit for bit.
+"""
+
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.errors import SkyfixError
+
+Tree: TypeAlias = bool | int | float | str | NDArray[Any] | list["Tree"] | dict[str, "Tree"] | None
+
+_JSON = "json"
+_ARRAY = "$array"  # the key of a reference to an array; no key of a tree
+
+
+def write_archive(path: str | Path, tree: Tree) -> None:
+    """Write a tree to a file that either is there as a whole or not at all.
+
+    Raises
+    ------
+    SkyfixError
+        When the file cannot be written.
+    """
+    path = Path(path)
+    arrays: dict[str, NDArray[Any]] = {}
+    text = json.dumps(_packed(tree, arrays), allow_nan=False)
+    arrays[_JSON] = np.frombuffer(text.encode(), dtype=np.uint8)
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with zipfile.ZipFile(draft, "w") as archive:
+            for name, array in arrays.items():
+                undated = zipfile.ZipInfo(f"{name}.npy")  # the same tree, the same bytes
+                with archive.open(undated, "w", force_zip64=True) as entry:
+                    np.lib.format.write_array(entry, array, allow_pickle=False)
+        draft.replace(path)
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        raise SkyfixError(f"{path}: expected a file that can be written, got {error.strerror}") from error
+
+
+def read_archive(path: str | Path) -> Any:
+    """Read a tree.
+
+    Raises
+    ------
+    SkyfixError
+        When the file is not there or was not written by `write_archive`.
+    """
+    try:
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return _unpacked(json.loads(arrays[_JSON].tobytes().decode()), arrays)
+    except OSError as error:
+        raise SkyfixError(f"{path}: expected a saved file, got {error.strerror or error}") from error
+    except (ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        raise SkyfixError(f"{path}: expected a saved file, got something else or a damaged one") from error
+
+
+def _packed(tree: Tree, arrays: dict[str, NDArray[Any]]) -> Any:
+    if isinstance(tree, np.ndarray):
+        if tree.dtype.hasobject:
+            raise SkyfixError(f"archive: expected arrays of numbers, got {tree.dtype}")
+        name = f"array{len(arrays)}"
+        arrays[name] = tree
+        return {_ARRAY: name}
+    if isinstance(tree, dict):
+        if _ARRAY in tree:
+            raise SkyfixError(f"archive: expected keys other than {_ARRAY}, got it")
+        return {key: _packed(value, arrays) for key, value in tree.items()}
+    if isinstance(tree, list):
+        return [_packed(value, arrays) for value in tree]
+    return tree
+
+
+def _unpacked(packed: Any, arrays: Any) -> Any:
+    if isinstance(packed, dict):
+        if packed.keys() == {_ARRAY}:
+            return arrays[packed[_ARRAY]]
+        return {key: _unpacked(value, arrays) for key, value in packed.items()}
+    if isinstance(packed, list):
+        return [_unpacked(value, arrays) for value in packed]
+    return packed

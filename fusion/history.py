@@ -1,0 +1,91 @@
+"""Snapshots of a filter along the recent past, from which to go on again when something late arrives."""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from typing import Any
+
+from fusion.archive import Tree
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Node:
+    """A time to which the filter has been moved.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        When; `BEGINNING` for the filter as it started, at no time in particular.
+    state : dataclass
+        The filter's, after moving there and after the measurement there, if any.
+    distance_m : float or None
+        Driven since the last measurement; None when there has been none.
+    """
+
+    stamp_ns: int
+    state: Any
+    distance_m: float | None
+
+    def to_tree(self) -> dict[str, Tree]:
+        """Everything, for a file."""
+        names = self.state.__dataclass_fields__
+        state: dict[str, Tree] = {name: getattr(self.state, name) for name in names}
+        return {"stamp_ns": self.stamp_ns, "distance_m": self.distance_m, "state": state}
+
+
+class History:
+    """Nodes in order of time; there is always one.
+
+    Parameters
+    ----------
+    nodes : list of Node
+        At least one, with increasing stamps.
+    """
+
+    def __init__(self, nodes: list[Node]) -> None:
+        self._nodes = list(nodes)
+        self._stamps = [node.stamp_ns for node in nodes]
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    @property
+    def base(self) -> Node:
+        """The oldest node."""
+        return self._nodes[0]
+
+    @property
+    def head(self) -> Node:
+        """The newest node."""
+        return self._nodes[-1]
+
+    def append(self, node: Node) -> None:
+        """Add a node after all others."""
+        self._nodes.append(node)
+        self._stamps.append(node.stamp_ns)
+
+    def at_or_before(self, stamp_ns: int) -> Node | None:
+        """The last node that is not after a stamp."""
+        index = bisect_right(self._stamps, stamp_ns)
+        return self._nodes[index - 1] if index else None
+
+    def take_back(self, after_ns: int) -> int:
+        """Drop the nodes after a stamp, which is not before the base, and say how many."""
+        index = bisect_right(self._stamps, after_ns)
+        count = len(self) - index
+        del self._nodes[index:], self._stamps[index:]
+        return count
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop the nodes that going back to `stamp_ns` does not need."""
+        count = bisect_right(self._stamps, stamp_ns) - 1
+        if count > 0:
+            del self._nodes[:count], self._stamps[:count]
+
+    def to_tree(self) -> Tree:
+        """Everything, for a file."""
+        return [node.to_tree() for node in self._nodes]
+
+
+def history_from_tree(tree: Any, state_type: type) -> History:
+    """The history that was written, of a filter whose states are of a given type."""
+    return History([Node(entry["stamp_ns"], state_type(**entry["state"]), entry["distance_m"]) for entry in tree])

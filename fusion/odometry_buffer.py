@@ -1,0 +1,227 @@
+"""The recent past of an odometry that arrives sample by sample, in any order: motions between any two times in it."""
+
+from bisect import bisect_left, bisect_right
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from fusion import se2
+from fusion.archive import Tree
+from fusion.arrays import FloatArray
+from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate
+from fusion.odometry_limits import MotionKind, OdometryLimits, part_of
+
+BEGINNING = -(2**63)
+"""Before every stamp."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometrySample:
+    """One message of an odometry.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        When.
+    value : (3,) float64
+        Pose in the odometry's own frame; or, with a covariance, the motion since the sample before.
+    covariance : (3, 3) float64 or None
+        Of the motion; None says that the value is a pose.
+    """
+
+    stamp_ns: int
+    value: FloatArray
+    covariance: FloatArray | None = None
+
+    def same_as(self, other: "OdometrySample") -> bool:
+        """Whether both say the same."""
+        if self.covariance is None or other.covariance is None:
+            same = self.covariance is other.covariance
+        else:
+            same = np.array_equal(self.covariance, other.covariance)
+        return same and self.stamp_ns == other.stamp_ns and np.array_equal(self.value, other.value)
+
+
+class OdometryBuffer:
+    """Samples in order of their stamps, each with the kind of the motion into it.
+
+    Parameters
+    ----------
+    noise : OdometryNoise
+        Gives poses' motions their covariance; samples with a covariance of their own keep that.
+    limits : OdometryLimits
+        What can be believed.
+    entry : OdometrySample or None
+        The last sample on a clock that has been set back since: the motion into the first sample begins there.
+    """
+
+    def __init__(self, noise: OdometryNoise, limits: OdometryLimits, entry: OdometrySample | None = None) -> None:
+        self.kind_counts: Counter[str] = Counter()
+        self._noise, self._limits, self._entry = noise, limits, entry
+        self._stamps: list[int] = []
+        self._samples: list[OdometrySample] = []
+        self._deltas: list[FloatArray] = []
+        self._kinds: list[MotionKind] = []
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def first_ns(self) -> int:
+        """Oldest stamp held."""
+        return self._stamps[0]
+
+    @property
+    def newest(self) -> OdometrySample:
+        """The sample with the newest stamp."""
+        return self._samples[-1]
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether the samples reach from before a stamp to after it, or hit it."""
+        return bool(self._stamps) and self._stamps[0] <= stamp_ns <= self._stamps[-1]
+
+    def get(self, stamp_ns: int) -> OdometrySample | None:
+        """The sample with exactly this stamp."""
+        index = bisect_left(self._stamps, stamp_ns)
+        return self._samples[index] if index < len(self) and self._stamps[index] == stamp_ns else None
+
+    def at_or_before(self, stamp_ns: int) -> int | None:
+        """Stamp of the last sample that is not after `stamp_ns`."""
+        index = bisect_right(self._stamps, stamp_ns)
+        return self._stamps[index - 1] if index else None
+
+    def insert(self, sample: OdometrySample) -> int:
+        """Put a sample with a new stamp in its place; all that was known up to the returned stamp still holds."""
+        index = bisect_left(self._stamps, sample.stamp_ns)
+        self._stamps.insert(index, sample.stamp_ns)
+        self._samples.insert(index, sample)
+        delta, kind = self._motion_into(index)
+        self._deltas.insert(index, delta)
+        self._kinds.insert(index, kind)
+        self.kind_counts[kind] += 1
+        if index + 1 < len(self):
+            self.kind_counts[self._kinds[index + 1]] -= 1
+            self._deltas[index + 1], self._kinds[index + 1] = self._motion_into(index + 1)
+            self.kind_counts[self._kinds[index + 1]] += 1
+        return self._stamps[index - 1] if index else BEGINNING
+
+    def next_step(self, after_ns: int, step_ns: int) -> int | None:
+        """The first stamp after another at which a new multiple of `step_ns` has been passed, or odometry begins."""
+        index = bisect_right(self._stamps, after_ns)
+        if index == 0 and self._stamps:
+            return self._stamps[0]
+        for later in range(index, len(self)):
+            if self._stamps[later] // step_ns != self._stamps[later - 1] // step_ns:
+                return self._stamps[later]
+        return None
+
+    def entry_motion(self) -> OdometryIncrement | None:
+        """The motion into the first sample from before the clock was set back; None at the start of everything."""
+        if self._entry is None:
+            return None
+        return self._piece(0, 1.0, self._limits.gap_s, self._stamps[0])
+
+    def motion(self, start_ns: int, end_ns: int) -> OdometryIncrement:
+        """The motion between two covered stamps, the first before the second."""
+        index, last = bisect_right(self._stamps, start_ns), bisect_left(self._stamps, end_ns)
+        pieces = []
+        while index <= last:
+            stop = index
+            while stop < last and self._is_driven_pose(index) and self._is_driven_pose(stop + 1):
+                stop += 1
+            begin, end = max(start_ns, self._stamps[index - 1]), min(end_ns, self._stamps[stop])
+            pieces.append(self._chord(index, stop, begin, end))
+            index = stop + 1
+        return accumulate(pieces)
+
+    def extrapolated(self, stamp_ns: int) -> OdometryIncrement:
+        """The motion from the newest sample to a later stamp: the mean velocity of the last `gap_s` goes on.
+
+        It goes on for `gap_s` at most, and not at all after a gap or a reset; the variances grow as in a gap.
+        """
+        newest_ns, gap_ns = self._stamps[-1], round(1e9 * self._limits.gap_s)
+        start_ns = max(self._stamps[0], newest_ns - gap_ns)
+        ahead_ns = stamp_ns - newest_ns
+        delta = np.zeros(3)
+        inside = range(bisect_right(self._stamps, start_ns), len(self))
+        if inside and all(self._kinds[index] is MotionKind.DRIVEN for index in inside):
+            velocity = se2.log(self.motion(start_ns, newest_ns).delta) / (newest_ns - start_ns)
+            delta = se2.exp(velocity * min(ahead_ns, gap_ns))
+        seconds = min(1e-9 * ahead_ns, self._limits.clock_jump_s)
+        covariance = self._noise.covariance(delta, seconds) + self._limits.gap_covariance(seconds)
+        return OdometryIncrement(stamp_ns, delta, covariance)
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop the samples that motions from `stamp_ns` on do not need."""
+        count = bisect_right(self._stamps, stamp_ns) - 1
+        if count > 0:
+            del self._stamps[:count], self._samples[:count], self._deltas[:count], self._kinds[:count]
+            self._entry = None
+
+    def to_tree(self) -> Tree:
+        """Everything, for a file."""
+        return {
+            "samples": [sample_tree(sample) for sample in self._samples],
+            "entry": None if self._entry is None else sample_tree(self._entry),
+            "kind_counts": dict(self.kind_counts),
+        }
+
+    @classmethod
+    def from_tree(cls, tree: Any, noise: OdometryNoise, limits: OdometryLimits) -> Self:
+        """The buffer that was written."""
+        entry = None if tree["entry"] is None else OdometrySample(**tree["entry"])
+        buffer = cls(noise, limits, entry)
+        for sample in tree["samples"]:
+            buffer.insert(OdometrySample(**sample))
+        buffer.kind_counts = Counter(tree["kind_counts"])
+        return buffer
+
+    def _motion_into(self, index: int) -> tuple[FloatArray, MotionKind]:
+        before = self._samples[index - 1] if index else self._entry
+        sample = self._samples[index]
+        if before is None:
+            return np.zeros(3), MotionKind.START
+        delta = sample.value if sample.covariance is not None else se2.between(before.value, sample.value)
+        if index:
+            return delta, self._limits.kind(delta, 1e-9 * (sample.stamp_ns - before.stamp_ns))
+        is_reset = self._limits.kind(delta, self._limits.gap_s) is MotionKind.RESET
+        return delta, MotionKind.RESET if is_reset else MotionKind.CLOCK_JUMP
+
+    def _is_driven_pose(self, index: int) -> bool:
+        return self._kinds[index] is MotionKind.DRIVEN and self._samples[index].covariance is None
+
+    def _chord(self, first: int, last: int, start_ns: int, end_ns: int) -> OdometryIncrement:
+        """The motion within the motions into samples `first` to `last`: several only where poses were driven."""
+        begin, end = self._share(first, start_ns), self._share(last, end_ns)
+        if not self._is_driven_pose(first):
+            return self._piece(first, end - begin, 1e-9 * (self._stamps[first] - self._stamps[first - 1]), end_ns)
+        delta = se2.between(self._pose(first, begin), self._pose(last, end))
+        return OdometryIncrement(end_ns, delta, self._noise.covariance(delta, 1e-9 * (end_ns - start_ns)))
+
+    def _share(self, index: int, stamp_ns: int) -> float:
+        before_ns = self._stamps[index - 1]
+        return (stamp_ns - before_ns) / (self._stamps[index] - before_ns)
+
+    def _pose(self, index: int, share: float) -> FloatArray:
+        if share == 1.0:
+            return self._samples[index].value
+        return se2.compose(self._samples[index - 1].value, part_of(self._deltas[index], share))
+
+    def _piece(self, index: int, share: float, seconds: float, stamp_ns: int) -> OdometryIncrement:
+        """A share, ending at `stamp_ns`, of the one motion into a sample, which took `seconds` as a whole."""
+        kind, own = self._kinds[index], self._samples[index].covariance
+        if kind is MotionKind.RESET:
+            return OdometryIncrement(stamp_ns, np.zeros(3), share * self._limits.reset_covariance(seconds))
+        delta = part_of(self._deltas[index], share)
+        known = share * min(seconds, self._limits.clock_jump_s)
+        covariance = self._noise.covariance(delta, known) if own is None else share * own
+        if kind is not MotionKind.DRIVEN:
+            covariance = covariance + share * self._limits.gap_covariance(seconds)
+        return OdometryIncrement(stamp_ns, delta, covariance)
+
+
+def sample_tree(sample: OdometrySample) -> dict[str, Tree]:
+    """A sample, for a file."""
+    return {"stamp_ns": sample.stamp_ns, "value": sample.value, "covariance": sample.covariance}

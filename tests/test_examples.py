@@ -1,0 +1,25 @@
+"""The examples run as they stand and say what they claim."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def test_online_tracking_stays_near_while_odometry_drifts(capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(EXAMPLES / "online_tracking.py"), run_name="__main__")
+    text = capsys.readouterr().out
+    assert "emulated" in text
+    rows = re.findall(r"([\d.]+) m +([\d.]+) m +([\d.]+) m +([\d.]+)$", text, flags=re.MULTILINE)
+    assert len(rows) == 10
+    off, sigma, odometry, lost = (float(value) for value in rows[-1])
+    assert off < 3.0 * sigma
+    assert off < 0.5 * odometry
+    assert sigma < 1.5
+    assert lost < 0.1
+    assert re.search(r"2001 odometry messages, 40 likelihoods, 40 of them late and replayed", text)
