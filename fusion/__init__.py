@@ -10,6 +10,7 @@ from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.kld_sampling import KldSampling
+from fusion.lazy_orientation import LazyOrientation
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
@@ -24,6 +25,7 @@ __all__ = [
     "GaussianLikelihood",
     "GaussianMixture",
     "KldSampling",
+    "LazyOrientation",
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "MapGrid",
