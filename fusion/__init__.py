@@ -23,6 +23,7 @@ from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
 from fusion.kalman_filter import KalmanFilter, KalmanFilterSettings
 from fusion.kld_sampling import KldSampling
+from fusion.lazy_orientation import LazyOrientation
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
 from fusion.location_orientation import LocationOrientationMaps
@@ -60,6 +61,7 @@ __all__ = [
     "KalmanFilter",
     "KalmanFilterSettings",
     "KldSampling",
+    "LazyOrientation",
     "LikelihoodEmulator",
     "LikelihoodVolume",
     "LocationOrientationMaps",

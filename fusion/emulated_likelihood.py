@@ -113,6 +113,11 @@ class EmulatedLikelihood:
         side = 2.0 * half / _GRID_CELLS
         return MapGrid(_GRID_CELLS, _GRID_CELLS, side, float(self.answer[0]) - half, float(self.answer[1]) - half)
 
+    @property
+    def searched_volume(self) -> float:
+        """The searched box, m^2 rad."""
+        return float(np.prod(2.0 * self.half_box))
+
     def log_density(self, poses: ArrayLike) -> FloatArray:
         """ln density (N,) at poses (N, 3); the floor where every component is cut off."""
         seen = se2.between(self.answer, checked("poses", poses, ("N", 3)))
@@ -128,6 +133,10 @@ class EmulatedLikelihood:
         mass = np.exp(log_mass - log_mass.max())
         of = rng.choice(len(mass), size=n, p=mass / mass.sum())
         return se2.compose(self.answer, low[of] + rng.random((n, 3)) * sides[of])
+
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """`log_density`; draws of a tempered density differ from it within the cells that they are made by."""
+        return self.log_density(poses)
 
     def modes(self, k: int) -> GaussianMixture:
         """The at most `k` highest components, with the moments that they have when cut off."""

@@ -8,6 +8,7 @@ where T is the temperature, Z(T) the integral of the density to the power 1 / T,
 the crop times all headings. So a lookup is the likelihood's own array and the two numbers 1 / T and ln Z(T).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -87,7 +88,20 @@ class Lookup:
         return arguments
 
 
-def lookup_of(likelihood: object, temperature: float) -> Lookup | None:
-    """What the compiled step reads of a likelihood with a method ``lookup(temperature)``; None when it has none."""
-    found = getattr(likelihood, "lookup", None)
-    return None if found is None else found(temperature)
+def lookup_of(likelihood: object, temperature: float, poses: Callable[[], FloatArray]) -> Lookup | None:
+    """What the compiled step reads of a likelihood; None when it has to be asked for every particle instead.
+
+    Parameters
+    ----------
+    likelihood
+        One with a method ``lookup(temperature)``, or one that works its table out near poses (N, 3) only and has
+        ``lookup_near(poses)``, then at temperature 1.
+    temperature
+        Flattens the likelihood.
+    poses
+        Gives the particles, when they are wanted.
+    """
+    whole, near = getattr(likelihood, "lookup", None), getattr(likelihood, "lookup_near", None)
+    if whole is not None:
+        return whole(temperature)
+    return near(poses()) if near is not None and temperature == 1.0 else None

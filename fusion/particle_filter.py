@@ -241,9 +241,10 @@ class ParticleFilter:
         if self.settings.guided_share > 0.0:
             return self._weigh_guided(likelihood.tempered(temperature).with_outliers(self.settings.outlier_probability))
         mixture = likelihood.with_outliers(self.settings.outlier_probability)
-        lookup = lookup_of(mixture.likelihood, temperature) if isinstance(mixture, OutlierMixture) else None
-        if isinstance(mixture, OutlierMixture) and lookup is not None:
-            return self._cloud.weigh(lookup, mixture.probability)
+        if isinstance(mixture, OutlierMixture):
+            lookup = lookup_of(mixture.likelihood, temperature, self._cloud.poses)
+            if lookup is not None:
+                return self._cloud.weigh(lookup, mixture.probability)
         measurement = likelihood.tempered(temperature).with_outliers(self.settings.outlier_probability)
         log_likelihood = np.asarray(measurement.log_density(self._cloud.poses()), dtype=np.float64)
         if log_likelihood.shape != (len(self._cloud),) or not np.isfinite(log_likelihood).all():

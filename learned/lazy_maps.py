@@ -129,6 +129,11 @@ class LazyPoseMaps:
         valid[bins] = True
         return LikelihoodVolume.from_scores(scores, self.grid, valid=valid)
 
+    @property
+    def searched_volume(self) -> float:
+        """The crop times all headings, m^2 rad."""
+        return self.grid.area_m2 * se2.TWO_PI
+
     def log_density(self, poses: ArrayLike) -> FloatArray:
         """Trilinear interpolation of the joint log density at poses (N, 3); the head is applied around them alone."""
         poses = checked("poses", poses, ("N", 3))
@@ -162,6 +167,14 @@ class LazyPoseMaps:
         row, col = np.divmod(pixel, self.grid.cols)
         xy = self.grid.xy_from_pixel(np.stack([row, col], axis=-1) + jitter[:, :2])
         return np.column_stack([xy, se2.wrap((yaw_bin + jitter[:, 2] - 0.5) * se2.TWO_PI / self.yaw_bins)])
+
+    def draw_log_density(self, poses: ArrayLike) -> FloatArray:
+        """The log density (N,) of the cell that each pose (N, 3) lies in; the floor outside the crop."""
+        poses = checked("poses", poses, ("N", 3))
+        centres = self.grid.xy_from_pixel(np.floor(self.grid.pixel_from_xy(poses[:, :2])) + 0.5)
+        step = se2.TWO_PI / self.yaw_bins
+        of_cells = self.log_density(np.column_stack([centres, np.rint(poses[:, 2] / step) * step]))
+        return np.where(self.grid.contains(poses[:, :2]), of_cells, DEFAULT_FLOOR)
 
     def modes(self, k: int) -> GaussianMixture:
         """The at most `k` highest modes of the joint density, for which everything is written out."""

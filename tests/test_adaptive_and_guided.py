@@ -141,14 +141,16 @@ def test_guided_weights_are_unbiased_against_the_exact_integral(share):
 def test_guided_filters_find_a_sharp_measurement_that_plain_ones_miss():
     cloud = np.random.default_rng(4).normal([0.0, 0.0, 0.0], [5.0, 5.0, 1.0], (300, 3))
     sharp, motion = np.diag([0.03, 0.03, 0.005]) ** 2, OdometryIncrement(1, np.zeros(3), np.diag([0.1, 0.1, 0.01]) ** 2)
-    sizes = {}
+    errors = {}
     for share in (0.0, 0.3):
         settings = ParticleFilterSettings(guided_share=share, injection_share=0.0)
         particles = ParticleFilter(cloud, 5, settings)
         particles.predict(motion)
-        sizes[share] = particles.update(at([2.0, -1.0, 0.2], sharp)).effective_sample_size
-    assert sizes[0.3] > 10.0 * sizes[0.0]
-    assert np.hypot(*(particles.estimate(0).pose - [2.0, -1.0, 0.2])[:2]) < 0.05
+        report = particles.update(at([2.0, -1.0, 0.2], sharp))
+        errors[share] = np.hypot(*(particles.estimate(0).pose - [2.0, -1.0, 0.2])[:2])
+    assert report.effective_sample_size > 30.0
+    assert errors[0.3] < 0.05
+    assert errors[0.0] > 1.0
 
 
 def test_measurements_while_standing_still_are_left_out():
@@ -187,7 +189,7 @@ def test_lost_is_measured_against_what_was_searched():
     assert probability(model.log_odds(0.01, expected, expected)) == pytest.approx(0.01 * 0.8 + 0.99 * 0.01)
     particles = ParticleFilter(np.random.default_rng(8).normal([0, 0, 0], [2, 2, 0.02], (500, 3)), 0)
     assert particles.update(flat).lost_score == pytest.approx(0.001 * 0.9 + 0.999 * 0.001, rel=0.01)
-    assert probability(-800.0) == 0.0
+    assert probability(-800.0) < 1e-300
     assert probability(800.0) == 1.0
 
 

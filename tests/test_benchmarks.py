@@ -27,6 +27,7 @@ from benchmarks import (
 )
 from benchmarks.filter_model import cloud, example_volume
 from benchmarks.filter_packages import missing_packages, package_candidates
+from benchmarks.plots import write_plots
 from benchmarks.runner import WARM_UP_RUNS
 from benchmarks.training_cost import training_cost
 from fusion import GridFilter, se2
@@ -229,3 +230,11 @@ def test_bad_requests_are_one_line(
 ) -> None:
     assert skyfix_benchmark(monkeypatch, *arguments) == 2
     assert capsys.readouterr().err == f"skyfix: error: {message}\n"
+
+
+def test_plots_are_written_beside_the_file(tmp_path: Path) -> None:
+    rows = [row for case in TINY["filter_step"]() if case.name.startswith("step") for row in time_case("f", case, 1)]
+    written = write_plots(rows, tmp_path / "timings.json")
+    assert [path.name for path in written] == ["timings-particles.png", "timings-map.png"]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
+    assert write_plots([row for row in rows if row["size"] < 0], tmp_path / "timings.json") == []

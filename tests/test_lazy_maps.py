@@ -41,6 +41,8 @@ def test_densities_are_those_of_the_maps_written_out() -> None:
     maps = lazy.to_maps()
     assert maps.confidence == 0.25
     np.testing.assert_allclose(lazy.log_density(poses_about()), maps.log_density(poses_about()), atol=1e-5)
+    np.testing.assert_allclose(lazy.draw_log_density(poses_about()), maps.draw_log_density(poses_about()), atol=1e-5)
+    assert lazy.searched_volume == maps.searched_volume
     per_cell = logsumexp(maps.orientation.astype(np.float64), axis=0) + math.log(2 * math.pi / 18)
     np.testing.assert_allclose(per_cell, 0.0, atol=1e-5)
 
