@@ -278,7 +278,7 @@ class Cloud:
         if motion is not None:
             self._spare["cloud"], self._xyt = source, cloud
             self._spare["ancestors"] = ancestors
-            self._epoch += motion[MOVED] > 0.0
+            self._epoch += int(motion[MOVED] > 0.0)
         self._ancestors, self._motion = _NOBODY, None
         if lookup is not None or len(self._log_weights):
             self._spare["log weights"], self._log_weights = self._log_weights, out

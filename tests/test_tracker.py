@@ -136,6 +136,7 @@ class Strange:
     """A likelihood that gives what it is told to give away from the middle of its crop."""
 
     grid = GRID
+    searched_volume = GRID.area_m2 * 2.0 * np.pi
 
     def __init__(self, away):
         self.away = away
