@@ -97,7 +97,7 @@ class TorchFilter:
         return cls(
             torch.from_numpy(particles.astype(np.float32)),
             torch.from_numpy(padded)[None, None],
-            torch.from_numpy(grid.centre_xy.astype(np.float32)),
+            torch.tensor(grid.centre_xy.tolist()),
             torch.tensor(half) * grid.metres_per_pixel,
             float(np.exp(log_uniform_density(grid))),
             volume.floor,
@@ -107,7 +107,7 @@ class TorchFilter:
     def step(self) -> Estimated:
         """Mean and covariance of the weighted cloud, then resampling."""
         p = self.particles
-        root, delta = torch.from_numpy(NOISE_ROOT).float(), torch.from_numpy(INCREMENT.delta).float()
+        root, delta = torch.from_numpy(NOISE_ROOT).float(), torch.tensor(INCREMENT.delta.tolist())
         forward, left, turn = (delta + torch.randn(p.shape, generator=self.generator) @ root.T).T
         cos, sin = torch.cos(p[:, 2]), torch.sin(p[:, 2])
         yaw = torch.remainder(p[:, 2] + turn + np.pi, se2.TWO_PI) - np.pi

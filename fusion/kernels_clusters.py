@@ -90,3 +90,29 @@ def moments_of(
             for b in range(3):
                 covariances[m, a, b] += share * residual[a] * residual[b]
     return mass, means, covariances
+
+
+@numba.njit(**_OPTIONS)
+def spread_in_clusters(
+    poses: NDArray[np.float64],
+    labels: NDArray[np.int64],
+    means: NDArray[np.float64],
+    roots: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    noise: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Poses (N, 3) drawn towards their cluster's mean, with kernel noise of `widths` (M,) times its root (M, 3, 3)."""
+    moved = np.empty_like(poses)
+    for i in range(len(poses)):
+        m = labels[i]
+        h = widths[m]
+        shrink = np.sqrt(1.0 - h * h)
+        for axis in range(3):
+            residual = poses[i, axis] - means[m, axis]
+            if axis == 2:
+                residual -= 2.0 * np.pi * np.floor((residual + np.pi) / (2.0 * np.pi))
+            kick = roots[m, axis, 0] * noise[i, 0] + roots[m, axis, 1] * noise[i, 1] + roots[m, axis, 2] * noise[i, 2]
+            moved[i, axis] = means[m, axis] + shrink * residual + h * kick
+        yaw = moved[i, 2] - 2.0 * np.pi * np.floor((moved[i, 2] + np.pi) / (2.0 * np.pi))
+        moved[i, 2] = yaw if yaw < np.pi else -np.pi
+    return moved

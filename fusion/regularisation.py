@@ -14,9 +14,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from fusion import se2
 from fusion.arrays import FloatArray
 from fusion.clusters import CELL_M, CELL_RAD, find_clusters
+from fusion.kernels_clusters import spread_in_clusters
 
 FloatOrArray = TypeVar("FloatOrArray", float, FloatArray)
 
@@ -43,9 +43,8 @@ def regularised(particles: FloatArray, scale: float, rng: np.random.Generator) -
         return particles
     clusters = find_clusters(particles, np.full(len(particles), 1.0 / len(particles)))
     count = np.bincount(clusters.labels).astype(np.float64)
-    width = scale * silverman_bandwidth(count, 3)[clusters.labels, None]
-    kernel = matrix_root(clusters.covariances)[clusters.labels]
-    noise = np.einsum("nij,nj->ni", kernel, rng.standard_normal(particles.shape))
-    moved = clusters.means[clusters.labels] + np.sqrt(1.0 - width**2) * clusters.residuals(particles) + width * noise
-    moved[:, 2] = se2.wrap(moved[:, 2])
-    return moved
+    widths = scale * silverman_bandwidth(count, 3)
+    roots = matrix_root(clusters.covariances)
+    noise = rng.standard_normal(particles.shape)
+    particles = np.ascontiguousarray(particles)
+    return spread_in_clusters(particles, clusters.labels, clusters.means, roots, widths, noise)
