@@ -115,8 +115,8 @@ class EmulatedLikelihood:
 
     @property
     def searched_volume(self) -> float:
-        """The searched box, m^2 rad."""
-        return float(np.prod(2.0 * self.half_box))
+        """The searched square times the headings that a component reaches, m^2 rad."""
+        return float(4.0 * self.half_box[0] * self.half_box[1] * 2.0 * self.halves[:, 2].max())
 
     def log_density(self, poses: ArrayLike) -> FloatArray:
         """ln density (N,) at poses (N, 3); the floor where every component is cut off."""

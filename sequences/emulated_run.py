@@ -24,11 +24,11 @@ from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
 from fusion.odometry import OdometryNoise, increments_at
+from fusion.odometry_calibration import OdometryCalibration
 from fusion.particle_filter import ParticleFilter
 from fusion.particle_smoother import ParticleSmootherSettings, sample_paths
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
-from sequences.clock_offset import shifted
 from sequences.metrics import summarise
 from sequences.start import offset_in_box
 
@@ -55,8 +55,8 @@ class EmulatedRunSettings:
         Correlation length that the filter flattens likelihoods for: 0 takes errors for independent, None knows the
         emulator's own. One found by `estimate_error_correlation` is what a user would have: errors with tails repeat
         less than the Gaussians that they are drawn by.
-    odometry_clock_s
-        Moves the odometry's stamps, for an odometry whose clock is known to be off.
+    calibration
+        The odometry's constant errors, taken out beforehand.
     noise, smoother
         The odometry's noise, and how paths are drawn.
     """
@@ -68,7 +68,7 @@ class EmulatedRunSettings:
     kept_particles: int = 2000
     measure_every_m: float = 4.0
     handled_length_m: float | None = None
-    odometry_clock_s: float = 0.0
+    calibration: OdometryCalibration = field(default_factory=OdometryCalibration)
     noise: OdometryNoise = field(default_factory=OdometryNoise)
     smoother: ParticleSmootherSettings = field(default_factory=lambda: ParticleSmootherSettings(paths=300))
 
@@ -157,7 +157,7 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
     stamps, poses, profile = truth.stamp_ns, truth.poses, settings.profile
     if len(truth) < 2:
         raise SkyfixError(f"truth: expected at least two poses, got {len(truth)}")
-    moved = shifted(odometry, settings.odometry_clock_s) if settings.odometry_clock_s else odometry
+    moved = settings.calibration.corrected(odometry)
     increments = increments_at(stamps, moved, settings.noise, tolerance_ns=1_000_000)
     box = (profile.half_extent_m, profile.half_heading_rad)
     start = poses[0] + offset_in_box(*box, np.random.default_rng([settings.seed, _START_STREAM]), 1)[0]

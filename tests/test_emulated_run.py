@@ -16,6 +16,7 @@ from fusion import (
     Trajectory,
     se2,
 )
+from fusion.odometry_calibration import OdometryCalibration
 from sequences.emulated_odometry import emulate_odometry
 from sequences.emulated_run import EmulatedRunSettings, run_emulated
 from sequences.folder import FolderSequence
@@ -48,7 +49,11 @@ def test_fusing_emulated_measurements_beats_them_and_the_odometry() -> None:
 def test_settings_reach_the_run() -> None:
     truth = winding_drive(60)
     settings = EmulatedRunSettings(
-        ORIENTERNET_KITTI_SEQUENTIAL, particles=300, measure_every_m=0.0, smoother=QUICK, odometry_clock_s=0.1
+        ORIENTERNET_KITTI_SEQUENTIAL,
+        particles=300,
+        measure_every_m=0.0,
+        smoother=QUICK,
+        calibration=OdometryCalibration(clock_offset_s=0.1),
     )
     run = run_emulated(truth, emulate_odometry(truth, 1), settings)
     assert len(run.measured) == 60
