@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from fusion import se2
 from fusion.errors import SkyfixError
@@ -106,6 +108,8 @@ def train_from_config(
     if options.initial is not None:
         initial = load_network(options.initial, config.training.network.architecture)[0].state_dict()
         config = config.with_initial(options.initial)
+    elif config.initial_share > 0.0:
+        raise SkyfixError(f"initial_share: expected --initial with a share of {config.initial_share:g}, got none")
     make_folder(out_dir)
     cache_dir = options.cache_dir or out_dir / "cache"
     with joined_processes() as processes:
@@ -133,7 +137,7 @@ def train_from_config(
             command = " ".join(["skyfix train", config_path.name, *(f"--set {o}" for o in options.overrides)])
             if options.initial is not None:
                 command += f" --initial {options.initial.name}"
-            _finish(net, far, config, command, path)
+            _finish(_averaged(net, initial, config.initial_share), far, config, command, path)
         processes.wait()
     return path
 
@@ -236,6 +240,14 @@ def _validation_view(config: TrainConfig, validation: SimulatedSamples, folder: 
             (folder / f"step_{step:06d}_{number}.png").write_bytes(png_bytes(figure))
 
     return view
+
+
+def _averaged(net: LocalizationNet, initial: Mapping[str, Tensor] | None, share: float) -> LocalizationNet:
+    """The network with a share of the weights that it started from mixed in."""
+    if initial is not None and share > 0.0:
+        trained = on_cpu(net).state_dict()
+        net.load_state_dict({name: torch.lerp(value, initial[name], share) for name, value in trained.items()})
+    return net
 
 
 def _finish(net: LocalizationNet, far: SimulatedSamples, config: TrainConfig, command: str, path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from fusion.errors import SkyfixError
 from learned.samples import SAMPLE_METRES_PER_PIXEL
@@ -25,12 +25,16 @@ class TrainConfig(BaseModel):
 
     Training sees scans to the reach of `training.network.bev`; afterwards the network is calibrated, and used, with
     scans to `matching_half_extent_m`, where its architecture allows another reach. Left out, that is 72 m, or the
-    network's own reach where it has but one. `initial` names the checkpoint that it started from, see `with_initial`.
+    network's own reach where it has but one. `initial` names the checkpoint that it started from, see `with_initial`;
+    `initial_share` is the weight of its weights in the average with the trained ones that is kept: what was learned
+    in training narrows, and half of either is at home in both domains (Wortsman et al., "Robust fine-tuning of
+    zero-shot models", CVPR 2022).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     initial: str | None = None
+    initial_share: float = Field(default=0.0, ge=0.0, lt=1.0)
     extracts: dict[str, float]
     matching_half_extent_m: float | None = None
     validation_extract: str

@@ -77,6 +77,22 @@ def test_training_goes_on_from_a_checkpoint(tiny: Path, tmp_path: Path) -> None:
     assert facts["config"]["initial"].startswith("rotmatch.safetensors sha256:")
     with pytest.raises(SkyfixError, match="holds a training with other settings, initial"):
         train_from_config(tiny, tmp_path, tmp_path / "second", options=replace(options, initial=None))
+    learned_much = ("training.learning_rate=1.0", "training.clip_norm=1e6", "training.warmup_steps=1")
+    halves = [
+        load_file(
+            train_from_config(
+                tiny,
+                tmp_path,
+                tmp_path / f"share{share}",
+                options=replace(options, overrides=(*learned_much, f"initial_share={share}")),
+            )
+        )
+        for share in (0.0, 0.25)
+    ]
+    for name, value in before.items():
+        assert torch.allclose(halves[1][name], 0.75 * halves[0][name] + 0.25 * value, atol=1e-5), name
+    with pytest.raises(SkyfixError, match=r"initial_share: expected --initial with a share of 0\.5, got none"):
+        train_from_config(tiny, tmp_path, tmp_path / "none", options=TrainOptions(("initial_share=0.5",)))
     wider = replace(options, overrides=("training.network.channels=6",))
     with pytest.raises(SkyfixError, match="the initial weights do not fit the network"):
         train_from_config(tiny, tmp_path, tmp_path / "third", options=wider)
