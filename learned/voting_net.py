@@ -106,7 +106,7 @@ class VotingNet(nn.Module, ABC):
         truth = true_pose(batch, index, self.stride, self.bev.size)
         device = features.scan.device
         yaws, widths = (drawn.to(device) for drawn in self.quadrature.draw(truth[2], generator))
-        scores = scores_of(features, index, yaws, chunk=len(yaws))
+        scores = scores_of(features, index, yaws)
         nll = scores_nll(scores, truth, yaws, widths, self.bev.metres_per_pixel * self.stride, self.quadrature)
         return Vote(scores, yaws, widths, truth, nll)
 
@@ -128,10 +128,10 @@ class Vote(NamedTuple):
     nll: Tensor
 
 
-def scores_of(features: VotingFeatures, index: int, yaws: Tensor, chunk: int = 16) -> Tensor:
+def scores_of(features: VotingFeatures, index: int, yaws: Tensor) -> Tensor:
     """Votes (R, rows, cols) of one example of a batch at some headings, the prior added."""
     scan, found = features.scan[index].float(), features.map[index].float()
-    scores = vote(found, scan, yaws, chunk)
+    scores = vote(found, scan, yaws)
     return scores if features.prior is None else scores + prior_scores(features.prior[index].float(), scan.shape[-1])
 
 
