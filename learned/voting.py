@@ -76,7 +76,7 @@ def vote(map_features: Tensor, scan_features: Tensor, yaws: Tensor) -> Tensor:
 
 
 def quarter_turn_groups(yaws: Tensor) -> Iterator[tuple[float, list[tuple[int, int]]]]:
-    """Headings (R,) that are quarter turns apart, together: a yaw of the first quarter, and (index, quarter turns) of each.
+    """Headings (R,) that are quarter turns apart, together: a yaw, and (index, turns) of each.
 
     Headings within the rounding of float32 count as one; a group that rounding tears apart costs time alone.
     """
