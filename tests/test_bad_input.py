@@ -129,7 +129,9 @@ def emulated(monkeypatch: pytest.MonkeyPatch, made_drive: MadeDrive) -> None:
     """Let the command line load the emulated matcher for 'emulated', and what it would have loaded otherwise."""
     load = learned.matcher.load_matcher
     matcher = EmulatedMatcher(made_drive.truth.poses)
-    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: matcher if name == "emulated" else load(name))
+    monkeypatch.setattr(
+        learned.matcher, "load_matcher", lambda name, *rest: matcher if name == "emulated" else load(name, *rest)
+    )
 
 
 def complaint(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
