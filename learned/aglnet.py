@@ -34,12 +34,13 @@ from torch.nn import functional
 from fusion.errors import SkyfixError
 from learned.bev import BANDS_M, BevSettings
 from learned.calibration import Calibration
+from learned.correlation import correlate
 from learned.feature_net import Pyramid
 from learned.losses import HeadingQuadrature, scores_nll
 from learned.network import Architecture, Batch
 from learned.skeleton import skeleton_loss, skeleton_targets
 from learned.two_stage import RefinementSettings, Window, headings_within, refined, window_about
-from learned.voting import correlate, rotate_templates, vote
+from learned.voting import rotate_templates, vote
 from learned.voting_net import VotingMatcher, check_images, true_pose
 from learned.warps import scaled_maps, scaled_scans, seen_from
 
@@ -183,7 +184,7 @@ class AglNet(nn.Module):
         settings = self.settings
         truth = true_pose(batch, index, self.coarse_stride, settings.bev.size)
         yaws, widths = (drawn.to(scan.coarse.device) for drawn in settings.quadrature.draw(truth[2], generator))
-        scores = vote(found.coarse[index], scan.coarse[index], yaws, chunk=len(yaws))
+        scores = vote(found.coarse[index], scan.coarse[index], yaws)
         cell = settings.bev.metres_per_pixel * self.coarse_stride
         return scores_nll(scores, truth, yaws, widths, cell, settings.quadrature)
 

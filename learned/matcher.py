@@ -15,6 +15,8 @@ from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
 from learned.map_raster import MapRaster
 
+_NAMES = ("rotmatch", "geometric")
+
 
 @dataclass(frozen=True, slots=True)
 class SearchRegion:
@@ -97,16 +99,39 @@ def matching_window(
     return MapGrid(size, size, metres_per_pixel, float(x0), float(y0))
 
 
-def load_matcher(name_or_path: str) -> MapMatcher:
-    """Load a matcher: 'rotmatch' (the shipped weights), 'geometric' (no learning) or a path (.safetensors).
+def load_matcher(name_or_path: str, backend: str | None = None) -> MapMatcher:
+    """Load a matcher: 'rotmatch' (the shipped weights), 'geometric' (no learning), a checkpoint or an export folder.
 
     A checkpoint's .json says which network it is of, see `learned.checkpoint.load_checkpoint`.
+
+    Parameters
+    ----------
+    name_or_path
+        A name, a .safetensors file, or a folder that `learned.export.export` wrote.
+    backend
+        What runs the encoders: 'torch' or a name of `learned.backends.BACKENDS`. None: torch; for a folder, the first
+        runtime that is installed.
 
     Raises
     ------
     SkyfixError
-        If the name is unknown, the file is missing, or the checkpoint does not match this version's network.
+        If a name is unknown, the file is missing, the checkpoint does not match this version's network, or the
+        backend is not installed or cannot run the matcher.
     """
+    from learned.backends import backend_named
+    from learned.exported import load_exported, with_backend
+
+    runtime = None if backend in (None, "torch") else backend_named(str(backend))
+    path = Path(name_or_path)
+    if name_or_path not in _NAMES and path.is_dir():
+        if backend == "torch":
+            raise SkyfixError(f"backend: expected openvino or onnxruntime for the export {path}, got torch")
+        return load_exported(path, runtime)
+    matcher = _torch_matcher(name_or_path)
+    return matcher if runtime is None else with_backend(matcher, runtime)
+
+
+def _torch_matcher(name_or_path: str) -> MapMatcher:
     from learned.checkpoint import load_checkpoint
     from learned.geometric import GeometricMatcher
     from learned.rotmatch import RotMatch
@@ -118,4 +143,5 @@ def load_matcher(name_or_path: str) -> MapMatcher:
     path = Path(name_or_path)
     if path.suffix == ".safetensors":
         return load_checkpoint(path)
-    raise SkyfixError(f"matcher: expected 'rotmatch', 'geometric' or a .safetensors file, got {name_or_path!r}")
+    expected = "'rotmatch', 'geometric', a .safetensors file or a folder of `skyfix export`"
+    raise SkyfixError(f"matcher: expected {expected}, got {name_or_path!r}")

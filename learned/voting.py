@@ -12,18 +12,21 @@ of the map window, and the grid of the scores is half a pixel off the map's.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
+from learned.correlation import MapCorrelator, correlate
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
+
+_SAME_YAW_RAD = 2e-6
+_ROTATED_AT_ONCE = 16
 
 
 def rotate_templates(features: Tensor, yaws: Tensor) -> Tensor:
@@ -51,59 +54,46 @@ def rotate_templates(features: Tensor, yaws: Tensor) -> Tensor:
     return torch.nn.functional.grid_sample(batch, flow, mode="bilinear", padding_mode="zeros", align_corners=False)
 
 
-def correlate(map_features: Tensor, templates: Tensor) -> Tensor:
-    """Correlate templates with the map wherever they lie wholly inside it.
+def vote(map_features: Tensor, scan_features: Tensor, yaws: Tensor) -> Tensor:
+    """Score (R, rows, cols) of headings `yaws` (R,) and all positions.
 
-    Parameters
-    ----------
-    map_features
-        (C, H, W).
-    templates
-        (R, C, h, w) with h <= H and w <= W.
-
-    Returns
-    -------
-    (R, H - h + 1, W - w + 1): sum over channels and pixels of map[c, r + i, q + j] * template[c, i, j]. No shift
-    wraps around: only shifts that keep the template inside are returned, so the map's own size is padding enough.
+    Where a gradient is wanted all headings are scored side by side; else one after the other, which is much quicker
+    and takes little memory (see `learned.correlation`).
     """
-    height, width = map_features.shape[-2:]
-    rows, cols = height - templates.shape[-2] + 1, width - templates.shape[-1] + 1
-    if rows < 1 or cols < 1:
-        raise SkyfixError(
-            f"voting: expected a template no larger than the map's {(height, width)}, got {tuple(templates.shape[-2:])}"
-        )
-    scores: Tensor = _Correlation.apply(map_features, templates)
-    return scores
+    if torch.is_grad_enabled() and (map_features.requires_grad or scan_features.requires_grad):
+        return correlate(map_features, rotate_templates(scan_features, yaws))
+    correlator, found = MapCorrelator(map_features), [Tensor()] * len(yaws)
+    groups = list(quarter_turn_groups(yaws))
+    for start in range(0, len(groups), _ROTATED_AT_ONCE):
+        block = groups[start : start + _ROTATED_AT_ONCE]
+        angles = torch.tensor([yaw for yaw, _ in block], dtype=torch.float64, device=yaws.device)
+        turned = rotate_templates(scan_features, angles)
+        for template, (_, members) in zip(turned, block, strict=True):
+            scores = correlator.scores(template, [turns for _, turns in members])
+            for (index, _), score in zip(members, scores, strict=True):
+                found[index] = score
+    return torch.stack(found)
 
 
-class _Correlation(torch.autograd.Function):
-    """Correlation by real FFTs, backwards too (autograd's own backward takes complex ones of full size)."""
+def quarter_turn_groups(yaws: Tensor) -> Iterator[tuple[float, list[tuple[int, int]]]]:
+    """Headings (R,) that are quarter turns apart, together: a yaw, and (index, turns) of each.
 
-    @staticmethod
-    def forward(ctx: Any, map_features: Tensor, templates: Tensor) -> Tensor:
-        height, width = map_features.shape[-2:]
-        map_spectrum = torch.fft.rfft2(map_features)
-        spectra = torch.fft.rfft2(templates, s=(height, width))
-        ctx.save_for_backward(map_spectrum, spectra)
-        ctx.shapes = (height, width), templates.shape[-2:]
-        scores = torch.fft.irfft2((spectra.conj() * map_spectrum).sum(dim=1), s=(height, width))
-        rows, cols = height - templates.shape[-2] + 1, width - templates.shape[-1] + 1
-        return scores[:, :rows, :cols].contiguous()
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
-        map_spectrum, spectra = ctx.saved_tensors
-        size, (rows, cols) = ctx.shapes
-        gradient = torch.fft.rfft2(gradients[0], s=size)[:, None]
-        to_map = torch.fft.irfft2((gradient * spectra).sum(dim=0), s=size)
-        to_templates = torch.fft.irfft2(gradient.conj() * map_spectrum, s=size)
-        return to_map, to_templates[..., :rows, :cols]
-
-
-def vote(map_features: Tensor, scan_features: Tensor, yaws: Tensor, chunk: int = 16) -> Tensor:
-    """Score (R, rows, cols) of headings `yaws` (R,) and all positions; `chunk` headings at a time bound the memory."""
-    blocks = [correlate(map_features, rotate_templates(scan_features, block)) for block in yaws.split(chunk)]
-    return torch.cat(blocks)
+    Headings within the rounding of float32 count as one; a group that rounding tears apart costs time alone.
+    """
+    quarter = math.pi / 2
+    turns_of = [math.floor((yaw + _SAME_YAW_RAD) / quarter) for yaw in yaws.tolist()]
+    parts = sorted((yaw - turns_of[i] * quarter, turns_of[i], i) for i, yaw in enumerate(yaws.tolist()))
+    group: list[tuple[int, int]] = []
+    first = 0.0
+    for yaw, turns, index in parts:
+        if group and yaw - first > _SAME_YAW_RAD:
+            yield first, group
+            group = []
+        if not group:
+            first = yaw
+        group.append((index, turns))
+    if group:
+        yield first, group
 
 
 def prior_scores(prior: Tensor, template_size: int) -> Tensor:

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from fusion.errors import SkyfixError
+from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
 from learned.bev import BANDS_M, BevSettings, bev_counts, log_density
 from learned.calibration import Calibration
 from learned.losses import HeadingQuadrature, scores_nll
 from learned.map_raster import MapRaster
 from learned.matcher import SearchRegion, matching_window
-from learned.network import Batch, LocalizationNet, picture_tensor
+from learned.network import Batch, NetworkSettings, picture_tensor
 from learned.voting import bin_yaws, prior_scores, volume_from_scores, vote, yaw_bins_within
 
 CROP_MULTIPLE = 16
@@ -47,12 +48,21 @@ class VotingFeatures(NamedTuple):
     prior: Tensor | None = None
 
 
-class PoseScorer(LocalizationNet, Protocol):
+class PoseScorer(Protocol):
     """A network that scores poses on a lattice of the map's cell corners; what `VotingMatcher` needs of it."""
+
+    @property
+    def settings(self) -> NetworkSettings:
+        """What it was built from."""
+        ...
 
     @property
     def stride(self) -> int:
         """Map pixels between the positions of the lattice."""
+        ...
+
+    def eval(self) -> object:
+        """Go into evaluation mode."""
         ...
 
     def pose_scores(self, density: Tensor, picture: Tensor, yaws: Tensor) -> Tensor:
@@ -106,7 +116,7 @@ class VotingNet(nn.Module, ABC):
         truth = true_pose(batch, index, self.stride, self.bev.size)
         device = features.scan.device
         yaws, widths = (drawn.to(device) for drawn in self.quadrature.draw(truth[2], generator))
-        scores = scores_of(features, index, yaws, chunk=len(yaws))
+        scores = scores_of(features, index, yaws)
         nll = scores_nll(scores, truth, yaws, widths, self.bev.metres_per_pixel * self.stride, self.quadrature)
         return Vote(scores, yaws, widths, truth, nll)
 
@@ -128,10 +138,10 @@ class Vote(NamedTuple):
     nll: Tensor
 
 
-def scores_of(features: VotingFeatures, index: int, yaws: Tensor, chunk: int = 16) -> Tensor:
+def scores_of(features: VotingFeatures, index: int, yaws: Tensor) -> Tensor:
     """Votes (R, rows, cols) of one example of a batch at some headings, the prior added."""
     scan, found = features.scan[index].float(), features.map[index].float()
-    scores = vote(found, scan, yaws, chunk)
+    scores = vote(found, scan, yaws)
     return scores if features.prior is None else scores + prior_scores(features.prior[index].float(), scan.shape[-1])
 
 
@@ -202,15 +212,19 @@ class VotingMatcher(Generic[Net]):
         self, counts: NDArray[np.float32], map_raster: MapRaster, search: SearchRegion
     ) -> LikelihoodVolume:
         """Match a bird's-eye view (bands, n, n) of point counts that has been made already."""
+        density, picture, grid = self.images(counts, map_raster, search)
+        bins = yaw_bins_within(float(search.centre[2]), search.half_heading_rad, self.yaw_bins)
+        with torch.inference_mode():
+            check_images(density[None], picture[None], self.net.settings.bev)
+            scores = self.net.pose_scores(density, picture, bin_yaws(bins, self.yaw_bins))
+        return volume_from_scores(scores / self.calibration.temperature, bins, self.yaw_bins, grid, self.net.stride)
+
+    def images(
+        self, counts: NDArray[np.float32], map_raster: MapRaster, search: SearchRegion
+    ) -> tuple[Tensor, Tensor, MapGrid]:
+        """What the network is given: log densities (bands, n, n) and a picture (3, m, m); and the picture's grid."""
         bev = self.net.settings.bev
         reach = bev.size / 2 * bev.metres_per_pixel
         window = matching_window(map_raster, search, reach, bev.metres_per_pixel, multiple_of=CROP_MULTIPLE)
         crop = map_raster.resampled(window)
-        bins = yaw_bins_within(float(search.centre[2]), search.half_heading_rad, self.yaw_bins)
-        density, picture = torch.from_numpy(log_density(counts)).float(), picture_tensor(crop.picture)
-        with torch.inference_mode():
-            check_images(density[None], picture[None], bev)
-            scores = self.net.pose_scores(density, picture, bin_yaws(bins, self.yaw_bins))
-        return volume_from_scores(
-            scores / self.calibration.temperature, bins, self.yaw_bins, crop.grid, self.net.stride
-        )
+        return torch.from_numpy(log_density(counts)).float(), picture_tensor(crop.picture), crop.grid

@@ -35,8 +35,18 @@ app = typer.Typer(
 MatcherOption = Annotated[
     str,
     typer.Option(
-        help="Matches scans with the map: rotmatch (learned, shipped), geometric (no learning) or a .safetensors file.",
+        help="Matches scans with the map: rotmatch (learned, shipped), geometric (no learning), a .safetensors file "
+        "or a folder of `skyfix export`.",
         metavar="NAME|FILE",
+    ),
+]
+BackendOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Runs rotmatch's encoders: torch, openvino, openvino-bf16, openvino-int8, onnxruntime or "
+        "onnxruntime-int8; those of int8 need a folder of `skyfix export --int8`. Default: torch, or for a folder the "
+        "first that is installed.",
+        metavar="NAME",
     ),
 ]
 SeedOption = Annotated[int, typer.Option(help="Of start, particles and simulated scans. Same seed, same numbers.")]
@@ -89,6 +99,7 @@ def track(
     out: OutOption = None,
     seed: SeedOption = 0,
     matcher: MatcherOption = "rotmatch",
+    backend: BackendOption = None,
     start: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
@@ -137,7 +148,7 @@ def track(
         correlation_length_m=correlation_length_m,
         map_error_m=map_error_m,
     )
-    _run(opened, matcher, settings, out, overwrite, quiet)
+    _run(opened, matcher, settings, out, overwrite, quiet, backend)
 
 
 @app.command(epilog="Example: `skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`")
@@ -234,6 +245,42 @@ def train(
         typer.echo(f"checkpoint: {checkpoint}")
 
 
+@app.command(
+    epilog="Examples:\n\n"
+    "`skyfix export rotmatch --out exported`\n\n"
+    "`skyfix export runs/training/rotmatch.safetensors --out exported --int8 drives/kitti_13`"
+)
+def export(
+    checkpoint: Annotated[
+        str, typer.Argument(help="rotmatch (shipped) or a .safetensors file of it.", metavar="CHECKPOINT")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder to write.", metavar="DIR")],
+    int8: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also write 8-bit graphs, with ranges taken from this drive with ground truth, or from the demo.",
+            metavar="SEQUENCE|demo",
+        ),
+    ] = None,
+    frames: Annotated[int, typer.Option(help="Scans of the drive to take ranges from.", metavar="N")] = 16,
+    seed: SeedOption = 0,
+) -> None:
+    """Write RotMatch's encoders as ONNX graphs, for `--matcher DIR` with a quicker runtime than torch."""
+    from learned.export import export as write_export
+    from learned.matcher import load_matcher
+    from learned.rotmatch import RotMatch
+    from sequences.demo import DemoSequence
+    from sequences.folder import FolderSequence
+    from sequences.matched_images import matched_images
+
+    matcher = load_matcher(checkpoint, "torch")
+    images = []
+    if int8 is not None and isinstance(matcher, RotMatch):
+        drive = DemoSequence(seed) if int8 == Path("demo") else FolderSequence(int8, seed)
+        images = matched_images(drive, matcher, frames)
+    typer.echo(f"export: {write_export(matcher, out, images)}")
+
+
 @app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")
 def view(run: Annotated[Path, typer.Argument(help="Run directory.", metavar="RUN")]) -> None:
     """Print the table of a run again, and where its report is."""
@@ -245,7 +292,10 @@ def view(run: Annotated[Path, typer.Argument(help="Run directory.", metavar="RUN
 @app.command(epilog="Example: `skyfix benchmark filter_step --json timings.json`")
 def benchmark(
     name: Annotated[
-        str | None, typer.Argument(help="filter_step or smoother. Default: all, one after the other.", metavar="NAME")
+        str | None,
+        typer.Argument(
+            help="filter_step, grid_filter, inference, smoother or translocnet. Default: all.", metavar="NAME"
+        ),
     ] = None,
     runs: Annotated[int, typer.Option(help="Timed runs of each implementation.", metavar="N")] = 15,
     json_file: JsonOption = None,
@@ -285,7 +335,13 @@ def default_odometry(sequence: Sequence) -> str:
 
 
 def _run(
-    sequence: Sequence, matcher_name: str, settings: TrackSettings, out: Path | None, overwrite: bool, quiet: bool
+    sequence: Sequence,
+    matcher_name: str,
+    settings: TrackSettings,
+    out: Path | None,
+    overwrite: bool,
+    quiet: bool,
+    backend: str | None = None,
 ) -> None:
     from learned.matcher import load_matcher
     from sequences.localize import track as track_drive
@@ -295,7 +351,7 @@ def _run(
 
     out = out or Path("runs") / f"{sequence.name}-{settings.odometry}-seed{settings.seed}"
     check_target(out, overwrite)
-    matcher = load_matcher(matcher_name)
+    matcher = load_matcher(matcher_name, backend)
     with ConsoleProgress(Console(stderr=True, quiet=quiet), sequence.name) as progress:
         result = track_drive(sequence, matcher, settings, progress)
     _show(result.metrics, write_run(result, out, overwrite))

@@ -117,7 +117,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "unknown odometry": (["--odometry", "sonar"], "odometry 'sonar': unknown for made_drive; there are: wheels"),
     "unknown matcher": (
         ["--matcher", "tea-leaves"],
-        "matcher: expected 'rotmatch', 'geometric' or",
+        "matcher: expected 'rotmatch', 'geometric', a .safetensors file or",
     ),
     "no particles": (["--particles", "0"], "particles: expected more than 0"),
     "heading too wide": (["--half-heading-deg", "270"], "half_heading_deg: expected at most 180"),
@@ -129,7 +129,9 @@ def emulated(monkeypatch: pytest.MonkeyPatch, made_drive: MadeDrive) -> None:
     """Let the command line load the emulated matcher for 'emulated', and what it would have loaded otherwise."""
     load = learned.matcher.load_matcher
     matcher = EmulatedMatcher(made_drive.truth.poses)
-    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: matcher if name == "emulated" else load(name))
+    monkeypatch.setattr(
+        learned.matcher, "load_matcher", lambda name, *rest: matcher if name == "emulated" else load(name, *rest)
+    )
 
 
 def complaint(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:

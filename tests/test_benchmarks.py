@@ -19,6 +19,7 @@ from benchmarks import (
     Case,
     filter_step,
     grid_filter,
+    inference,
     markdown_table,
     smoother,
     thread_statement,
@@ -31,13 +32,17 @@ from benchmarks.plots import write_plots
 from benchmarks.runner import WARM_UP_RUNS
 from benchmarks.training_cost import training_cost
 from fusion import GridFilter, se2
+from learned.bev import BevSettings
+from learned.rotmatch import RotMatchNet, RotMatchSettings
 from sequences.cli import main
 
 COLUMNS = {"benchmark", "case", "implementation", "size", "seconds_median", "seconds_min", "runs"}
 TINY_VOLUME = example_volume(cells=32, bins=36)
+TINY_VOTING = RotMatchNet(RotMatchSettings(4, (4, 4, 8, 8), BevSettings(16.0)))
 TINY: dict[str, Callable[[], Iterator[Case]]] = {
     "filter_step": lambda: filter_step.cases([50, 200], TINY_VOLUME, [8, 16]),
     "grid_filter": lambda: grid_filter.cases([24], headings=64),
+    "inference": lambda: inference.cases(TINY_VOTING, position_half_m=4.0, headings=(3,)),
     "smoother": lambda: smoother.cases([5, 20]),
     "translocnet": lambda: translocnet.cases([TINY_NETWORK]),
 }
@@ -219,7 +224,7 @@ def test_command_prints_a_table_and_writes_the_rows(
     [
         (
             ["nonsense"],
-            "benchmark: expected one of filter_step, grid_filter, smoother, translocnet, got 'nonsense'",
+            "benchmark: expected one of filter_step, grid_filter, inference, smoother, translocnet, got 'nonsense'",
         ),
         (["smoother", "--runs", "0"], "runs: expected >= 1, got 0"),
     ],

@@ -62,7 +62,7 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> TrackedRun:
     made = write_made_drive(tmp_path_factory.mktemp("cli") / "made_drive")
     out = made.path.parent / "run"
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(made.truth.poses))
+        monkeypatch.setattr(learned.matcher, "load_matcher", lambda *_: EmulatedMatcher(made.truth.poses))
         monkeypatch.setattr(sys, "argv", ["skyfix", "track", str(made.path), "--out", str(out), "--particles", "2000"])
         stdout, stderr = Lines(), Lines()
         monkeypatch.setattr(sys, "stdout", stdout)
@@ -131,7 +131,7 @@ def test_every_option_of_track_reaches_the_settings(
         seen.append(settings)
         raise SkyfixError("seen")
 
-    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(made_drive.truth.poses))
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda *_: EmulatedMatcher(made_drive.truth.poses))
     monkeypatch.setattr(sequences.localize, "track", stop)
     options = {
         "--odometry": "wheels",
@@ -174,7 +174,7 @@ def test_view_prints_the_same_table_again(
 def test_a_second_run_into_the_same_directory_needs_overwrite(
     tracked: TrackedRun, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(tracked.made.truth.poses))
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda *_: EmulatedMatcher(tracked.made.truth.poses))
     again = skyfix(capsys, monkeypatch, "track", str(tracked.made.path), "--out", str(tracked.out))
     assert again.code == 2
     assert "give --overwrite" in again.err
@@ -212,7 +212,7 @@ def test_demo_tracks_the_demo_sequence(
         seen.append((sequence.name, settings.seed))
         raise SkyfixError("seen")
 
-    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(made_drive.truth.poses))
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda *_: EmulatedMatcher(made_drive.truth.poses))
     monkeypatch.setattr(sequences.demo, "DemoSequence", lambda seed: FolderSequence(made_drive.path, seed))
     monkeypatch.setattr(sequences.localize, "track", stop)
     assert skyfix(capsys, monkeypatch, "demo", "--seed", "4", "--out", str(tmp_path / "out")).code == 2

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
-from learned.voting import bin_yaws, correlate, rotate_templates, volume_from_scores, vote, yaw_bins_within
+from learned.correlation import correlate, fast_length
+from learned.voting import bin_yaws, quarter_turn_groups, rotate_templates, volume_from_scores, vote, yaw_bins_within
 
 
 def test_correlation_equals_the_direct_sum() -> None:
@@ -28,9 +29,46 @@ def test_gradients_equal_those_of_the_direct_sum() -> None:
     torch.autograd.gradcheck(correlate, (scene, templates))
 
 
+@pytest.mark.parametrize("shape", [(19, 19), (17, 22), (23, 14)])
+def test_quick_voting_equals_turning_and_correlating_every_heading(shape: tuple[int, int]) -> None:
+    """Headings in any order, some of them quarter turns apart, on maps that are not square."""
+    generator = torch.Generator().manual_seed(5)
+    scene = torch.randn(3, *shape, generator=generator, dtype=torch.float64)
+    scan = torch.randn(3, 12, 12, generator=generator, dtype=torch.float64)
+    yaws = torch.tensor([30.0, -60.0, 12.5, 210.0, 0.0, 120.0, 90.0, 359.0], dtype=torch.float64).deg2rad()
+    direct = torch.nn.functional.conv2d(scene[None], rotate_templates(scan, yaws))[0]
+    torch.testing.assert_close(vote(scene, scan, yaws), direct, atol=1e-9, rtol=0)
+    with_gradients = vote(scene.requires_grad_(), scan, yaws)
+    assert with_gradients.requires_grad
+    torch.testing.assert_close(with_gradients.detach(), direct, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("bins", [36, 360])
+def test_every_heading_of_a_circle_is_turned_with_three_others(bins: int) -> None:
+    groups = list(quarter_turn_groups(bin_yaws(range(bins), bins)))
+    assert [len(members) for _, members in groups] == [4] * (bins // 4)
+    for yaw, members in groups:
+        assert -1e-5 < yaw < math.pi / 2 - 1e-3
+        for index, turns in members:
+            apart = yaw + turns * math.pi / 2 - index * 2 * math.pi / bins
+            assert abs(apart) < 1e-6
+
+
+@given(st.integers(1, 2000))
+def test_fast_lengths_hold_the_map_and_have_small_factors(least: int) -> None:
+    length = fast_length(least)
+    assert least <= length <= 2 * least + 8
+    for factor in (2, 3, 5, 7, 11, 13):
+        while length % factor == 0:
+            length //= factor
+    assert length == 1
+
+
 def test_template_larger_than_the_map_is_refused() -> None:
     with pytest.raises(SkyfixError, match="no larger than"):
         correlate(torch.zeros(1, 4, 4), torch.zeros(1, 1, 6, 6))
+    with pytest.raises(SkyfixError, match=r"no larger than the map's \(4, 7\), got \(6, 6\)"):
+        vote(torch.zeros(1, 4, 7), torch.zeros(1, 6, 6), torch.zeros(1))
 
 
 @pytest.mark.parametrize("turns", range(4))
