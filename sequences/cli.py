@@ -54,6 +54,14 @@ HalfExtentOption = Annotated[
 HalfHeadingOption = Annotated[
     float, typer.Option(help="The start's heading is known to within this, degrees; at most 180.", metavar="DEG")
 ]
+HalfHeadingsOption = Annotated[
+    list[float] | None,
+    typer.Option(
+        help="As for track; give it several times to compare starts, 180 for an unknown heading. Default: 10.",
+        metavar="DEG",
+    ),
+]
+MaxFramesOption = Annotated[int, typer.Option(help="Most scans of a sequence, spread evenly.", metavar="N")]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")]
 
 
@@ -140,7 +148,12 @@ def track(
     _run(opened, matcher, settings, out, overwrite, quiet)
 
 
-@app.command(epilog="Example: `skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`")
+@app.command(
+    epilog="Examples:\n\n"
+    "`skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`\n\n"
+    "`skyfix evaluate drives/mine --matcher rotmatch --matcher runs/hybrid/hybrid.safetensors "
+    "--half-heading-deg 10 --half-heading-deg 180 --markdown table.md`"
+)
 def evaluate(
     sequences: Annotated[list[Path], typer.Argument(help="Sequence folders with ground truth.", metavar="SEQUENCE")],
     matcher: Annotated[
@@ -150,33 +163,31 @@ def evaluate(
         ),
     ] = None,
     half_extent: HalfExtentOption = 20.0,
-    half_heading_deg: HalfHeadingOption = 10.0,
+    half_heading_deg: HalfHeadingsOption = None,
     heading_unknown: HeadingUnknownOption = False,
-    max_frames: Annotated[int, typer.Option(help="Most scans of a sequence, spread evenly.", metavar="N")] = 200,
+    max_frames: MaxFramesOption = 200,
     seed: SeedOption = 0,
     json_file: JsonOption = None,
+    markdown_file: Annotated[
+        Path | None,
+        typer.Option("--markdown", help="Also write the table, with a legend, to this file.", metavar="FILE"),
+    ] = None,
 ) -> None:
     """Score single shots: each scan by itself from a start that is off, beside the prior's own score."""
     from learned.matcher import load_matcher
-    from sequences.demo import DemoSequence
-    from sequences.evaluate import evaluate_single_shot, markdown_table
-    from sequences.folder import FolderSequence
+    from sequences.evaluate import evaluate_single_shot
+    from sequences.evaluation_tables import markdown_page, markdown_table, matcher_labels
+    from sequences.shot_protocol import ShotProtocol
 
-    half_heading = 180.0 if heading_unknown else half_heading_deg
-    loaded = {name: load_matcher(name) for name in matcher or ["rotmatch", "geometric"]}
-    evaluations = [
-        evaluate_single_shot(
-            DemoSequence(seed) if path == Path("demo") else FolderSequence(path, seed),
-            loaded,
-            half_extent,
-            half_heading,
-            max_frames,
-            seed,
-        )
-        for path in sequences
-    ]
+    headings = list(half_heading_deg or ([] if heading_unknown else [10.0])) + ([180.0] if heading_unknown else [])
+    protocols = [ShotProtocol(half_extent, heading, max_frames, seed) for heading in dict.fromkeys(headings)]
+    labels = matcher_labels(matcher or ["rotmatch", "geometric"])
+    loaded = {label: load_matcher(name) for label, name in labels.items()}
+    opened = [open_sequence(path, seed) for path in sequences]
+    evaluations = [evaluate_single_shot(each, loaded, protocol) for each in opened for protocol in protocols]
     typer.echo(markdown_table(evaluations), nl=False)
     _write_json(json_file, evaluations)
+    _write_text(markdown_file, markdown_page(evaluations, labels))
 
 
 @app.command(
@@ -262,6 +273,14 @@ def _root(show_version: Annotated[bool, typer.Option("--version", help="Print th
         raise typer.Exit
 
 
+def open_sequence(path: Path, seed: int) -> Sequence:
+    """The sequence in a folder; 'demo' is the embedded one."""
+    from sequences.demo import DemoSequence
+    from sequences.folder import FolderSequence
+
+    return DemoSequence(seed) if path == Path("demo") else FolderSequence(path, seed)
+
+
 def default_odometry(sequence: Sequence) -> str:
     """The first odometry that is not emulated, or else the first.
 
@@ -308,10 +327,14 @@ def _show(metrics: dict[str, object], report: Path) -> None:
 
 
 def _write_json(path: Path | None, content: object) -> None:
+    _write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def _write_text(path: Path | None, content: str) -> None:
     if path is None:
         return
     try:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        path.write_text(content, encoding="utf-8")
     except OSError as error:
         raise SkyfixError(f"{path}: cannot be written: {error.strerror}") from error
 
