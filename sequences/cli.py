@@ -17,6 +17,22 @@ import typer
 from rich.console import Console
 
 from fusion.errors import SkyfixError
+from sequences.cli_ablate import ablate
+from sequences.cli_options import (
+    HalfExtentOption,
+    HalfHeadingOption,
+    HalfHeadingsOption,
+    HeadingUnknownOption,
+    JsonOption,
+    MatcherOption,
+    MaxFramesOption,
+    OutOption,
+    OverwriteOption,
+    QuietOption,
+    SeedOption,
+    open_sequence,
+    training_line,
+)
 
 if TYPE_CHECKING:
     from sequences.sequence import Sequence
@@ -31,38 +47,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-MatcherOption = Annotated[
-    str,
-    typer.Option(
-        help="Matches scans with the map: rotmatch (learned, shipped), geometric (no learning) or a .safetensors file.",
-        metavar="NAME|FILE",
-    ),
-]
-SeedOption = Annotated[int, typer.Option(help="Of start, particles and simulated scans. Same seed, same numbers.")]
-OutOption = Annotated[
-    Path | None, typer.Option(help="Run directory to write. Default: runs/SEQUENCE-ODOMETRY-seedN.", metavar="DIR")
-]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in the directory.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
-HeadingUnknownOption = Annotated[
-    bool, typer.Option("--heading-unknown", help="The start's heading may be anything, as with --half-heading-deg 180.")
-]
-HalfExtentOption = Annotated[
-    float, typer.Option(help="The start is known to within a square of this half side, metres.", metavar="M")
-]
-HalfHeadingOption = Annotated[
-    float, typer.Option(help="The start's heading is known to within this, degrees; at most 180.", metavar="DEG")
-]
-HalfHeadingsOption = Annotated[
-    list[float] | None,
-    typer.Option(
-        help="As for track; give it several times to compare starts, 180 for an unknown heading. Default: 10.",
-        metavar="DEG",
-    ),
-]
-MaxFramesOption = Annotated[int, typer.Option(help="Most scans of a sequence, spread evenly.", metavar="N")]
-JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")]
 
 
 @app.command(epilog="Example: `skyfix demo --out runs/first`")
@@ -233,9 +217,16 @@ def train(
     from sequences.train_command import TrainOptions, train_from_config
 
     options = TrainOptions(tuple(override or ()), minutes, cache, tensorboard)
-    checkpoint = train_from_config(config, data, out, _training_line, options)
+    checkpoint = train_from_config(config, data, out, training_line, options)
     if os.environ.get("RANK", "0") == "0":  # of the processes that torchrun starts, the first speaks
         typer.echo(f"checkpoint: {checkpoint}")
+
+
+app.command(
+    epilog="Examples:\n\n"
+    "`skyfix ablate learned/configs/ablation_hybrid.yaml --data osm --out runs/ablation --minutes 20 --seeds 0,1,2`\n\n"
+    "`skyfix ablate learned/configs/sensitivity_hybrid.yaml --data osm --evaluate drives/mine`"
+)(ablate)
 
 
 @app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")
@@ -271,14 +262,6 @@ def _root(show_version: Annotated[bool, typer.Option("--version", help="Print th
     if show_version:
         typer.echo(f"skyfix {version('skyfix')}")
         raise typer.Exit
-
-
-def open_sequence(path: Path, seed: int) -> Sequence:
-    """The sequence in a folder; 'demo' is the embedded one."""
-    from sequences.demo import DemoSequence
-    from sequences.folder import FolderSequence
-
-    return DemoSequence(seed) if path == Path("demo") else FolderSequence(path, seed)
 
 
 def default_odometry(sequence: Sequence) -> str:
@@ -337,12 +320,6 @@ def _write_text(path: Path | None, content: str) -> None:
         path.write_text(content, encoding="utf-8")
     except OSError as error:
         raise SkyfixError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-def _training_line(step: int, steps: int, loss: float, validation: float | None) -> None:
-    if step % 50 == 0 or step == steps:
-        held_out = "" if validation is None else f", validation {validation:.3f}"
-        print(f"step {step}/{steps}: loss {loss:.3f}{held_out}", file=sys.stderr)
 
 
 def main() -> None:
