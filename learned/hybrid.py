@@ -60,6 +60,9 @@ class HybridSettings:
         Weight of the contrastive loss of scans and their maps, and the size of its vectors; 0 takes it away.
     regression_weight
         Weight of the Huber loss of the mean pose (soft-argmax), metres; 0 takes it away.
+    likelihood_weight
+        Weight of the negative log density of the true pose; 0 leaves the mean pose alone to learn from: direct
+        regression, as near as a network comes to it whose answer is a vote.
     bev, quadrature
         The scan's image; the headings at which the training's likelihood is evaluated.
     """
@@ -76,6 +79,7 @@ class HybridSettings:
     contrastive_weight: float = 0.1
     embedding: int = 32
     regression_weight: float = 0.1
+    likelihood_weight: float = 1.0
     bev: BevSettings = field(default_factory=BevSettings)
     quadrature: HeadingQuadrature = field(default_factory=HeadingQuadrature)
 
@@ -83,9 +87,12 @@ class HybridSettings:
         heads, width = self.attention_heads, self.widths[-1]
         if self.cross_attention and (heads < 1 or width % heads):
             raise SkyfixError(f"hybrid attention_heads: expected a divisor of {width}, got {heads}")
-        for name, weight in (("contrastive", self.contrastive_weight), ("regression", self.regression_weight)):
+        for name in ("contrastive_weight", "regression_weight", "likelihood_weight"):
+            weight = getattr(self, name)
             if not (math.isfinite(weight) and weight >= 0):
-                raise SkyfixError(f"hybrid {name}_weight: expected zero or more, got {weight}")
+                raise SkyfixError(f"hybrid {name}: expected zero or more, got {weight}")
+        if self.likelihood_weight == 0 and self.regression_weight == 0:
+            raise SkyfixError("hybrid: expected a likelihood_weight or a regression_weight above zero, got neither")
 
 
 class _Head(nn.Module):
@@ -156,12 +163,12 @@ class HybridNet(VotingNet):
         return torch.sigmoid(self.worth_head(finest).float() + _WORTH_BIAS)
 
     def losses(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
-        """Negative log density of the true poses, the switched-on auxiliary losses, and their weighted sum."""
+        """Negative log density of the true poses, the switched-on other losses, and their weighted sum."""
         check_images(batch.density, batch.picture, self.bev)
         scan, found = self.scan_trunk.encode(batch.density), self.map_trunk.encode(batch.picture)
         votes = self.voted(self._joined(scan, found), batch, generator)
         terms = {"nll": torch.stack([vote.nll for vote in votes]).mean()}
-        total = terms["nll"]
+        total = self.settings.likelihood_weight * terms["nll"]
         if self.settings.regression_weight > 0:
             cell = self.bev.metres_per_pixel * self.stride
             terms["regression"] = torch.stack([regression_loss(vote, cell) for vote in votes]).mean()

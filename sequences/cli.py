@@ -17,6 +17,23 @@ import typer
 from rich.console import Console
 
 from fusion.errors import SkyfixError
+from sequences.cli_ablate import ablate
+from sequences.cli_options import (
+    BackendOption,
+    HalfExtentOption,
+    HalfHeadingOption,
+    HalfHeadingsOption,
+    HeadingUnknownOption,
+    JsonOption,
+    MatcherOption,
+    MaxFramesOption,
+    OutOption,
+    OverwriteOption,
+    QuietOption,
+    SeedOption,
+    open_sequence,
+    training_line,
+)
 
 if TYPE_CHECKING:
     from sequences.sequence import Sequence
@@ -31,40 +48,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-MatcherOption = Annotated[
-    str,
-    typer.Option(
-        help="Matches scans with the map: rotmatch (learned, shipped), geometric (no learning), a .safetensors file "
-        "or a folder of `skyfix export`.",
-        metavar="NAME|FILE",
-    ),
-]
-BackendOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Runs rotmatch's encoders: torch, openvino, openvino-bf16, openvino-int8, onnxruntime or "
-        "onnxruntime-int8; those of int8 need a folder of `skyfix export --int8`. Default: torch, or for a folder the "
-        "first that is installed.",
-        metavar="NAME",
-    ),
-]
-SeedOption = Annotated[int, typer.Option(help="Of start, particles and simulated scans. Same seed, same numbers.")]
-OutOption = Annotated[
-    Path | None, typer.Option(help="Run directory to write. Default: runs/SEQUENCE-ODOMETRY-seedN.", metavar="DIR")
-]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in the directory.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
-HeadingUnknownOption = Annotated[
-    bool, typer.Option("--heading-unknown", help="The start's heading may be anything, as with --half-heading-deg 180.")
-]
-HalfExtentOption = Annotated[
-    float, typer.Option(help="The start is known to within a square of this half side, metres.", metavar="M")
-]
-HalfHeadingOption = Annotated[
-    float, typer.Option(help="The start's heading is known to within this, degrees; at most 180.", metavar="DEG")
-]
-JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")]
 
 
 @app.command(epilog="Example: `skyfix demo --out runs/first`")
@@ -151,7 +134,12 @@ def track(
     _run(opened, matcher, settings, out, overwrite, quiet, backend)
 
 
-@app.command(epilog="Example: `skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`")
+@app.command(
+    epilog="Examples:\n\n"
+    "`skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`\n\n"
+    "`skyfix evaluate drives/mine --matcher rotmatch --matcher runs/hybrid/hybrid.safetensors "
+    "--half-heading-deg 10 --half-heading-deg 180 --markdown table.md`"
+)
 def evaluate(
     sequences: Annotated[list[Path], typer.Argument(help="Sequence folders with ground truth.", metavar="SEQUENCE")],
     matcher: Annotated[
@@ -161,33 +149,31 @@ def evaluate(
         ),
     ] = None,
     half_extent: HalfExtentOption = 20.0,
-    half_heading_deg: HalfHeadingOption = 10.0,
+    half_heading_deg: HalfHeadingsOption = None,
     heading_unknown: HeadingUnknownOption = False,
-    max_frames: Annotated[int, typer.Option(help="Most scans of a sequence, spread evenly.", metavar="N")] = 200,
+    max_frames: MaxFramesOption = 200,
     seed: SeedOption = 0,
     json_file: JsonOption = None,
+    markdown_file: Annotated[
+        Path | None,
+        typer.Option("--markdown", help="Also write the table, with a legend, to this file.", metavar="FILE"),
+    ] = None,
 ) -> None:
     """Score single shots: each scan by itself from a start that is off, beside the prior's own score."""
     from learned.matcher import load_matcher
-    from sequences.demo import DemoSequence
-    from sequences.evaluate import evaluate_single_shot, markdown_table
-    from sequences.folder import FolderSequence
+    from sequences.evaluate import evaluate_single_shot
+    from sequences.evaluation_tables import markdown_page, markdown_table, matcher_labels
+    from sequences.shot_protocol import ShotProtocol
 
-    half_heading = 180.0 if heading_unknown else half_heading_deg
-    loaded = {name: load_matcher(name) for name in matcher or ["rotmatch", "geometric"]}
-    evaluations = [
-        evaluate_single_shot(
-            DemoSequence(seed) if path == Path("demo") else FolderSequence(path, seed),
-            loaded,
-            half_extent,
-            half_heading,
-            max_frames,
-            seed,
-        )
-        for path in sequences
-    ]
+    headings = list(half_heading_deg or ([] if heading_unknown else [10.0])) + ([180.0] if heading_unknown else [])
+    protocols = [ShotProtocol(half_extent, heading, max_frames, seed) for heading in dict.fromkeys(headings)]
+    labels = matcher_labels(matcher or ["rotmatch", "geometric"])
+    loaded = {label: load_matcher(name) for label, name in labels.items()}
+    opened = [open_sequence(path, seed) for path in sequences]
+    evaluations = [evaluate_single_shot(each, loaded, protocol) for each in opened for protocol in protocols]
     typer.echo(markdown_table(evaluations), nl=False)
     _write_json(json_file, evaluations)
+    _write_text(markdown_file, markdown_page(evaluations, labels))
 
 
 @app.command(
@@ -240,7 +226,7 @@ def train(
     from sequences.train_command import TrainOptions, train_from_config
 
     options = TrainOptions(tuple(override or ()), minutes, cache, tensorboard, initial)
-    checkpoint = train_from_config(config, data, out, _training_line, options)
+    checkpoint = train_from_config(config, data, out, training_line, options)
     if os.environ.get("RANK", "0") == "0":  # of the processes that torchrun starts, the first speaks
         typer.echo(f"checkpoint: {checkpoint}")
 
@@ -279,6 +265,13 @@ def export(
         drive = DemoSequence(seed) if int8 == Path("demo") else FolderSequence(int8, seed)
         images = matched_images(drive, matcher, frames)
     typer.echo(f"export: {write_export(matcher, out, images)}")
+
+
+app.command(
+    epilog="Examples:\n\n"
+    "`skyfix ablate learned/configs/ablation_hybrid.yaml --data osm --out runs/ablation --minutes 20 --seeds 0,1,2`\n\n"
+    "`skyfix ablate learned/configs/sensitivity_hybrid.yaml --data osm --evaluate drives/mine`"
+)(ablate)
 
 
 @app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")
@@ -371,18 +364,16 @@ def _show(metrics: dict[str, object], report: Path) -> None:
 
 
 def _write_json(path: Path | None, content: object) -> None:
+    _write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def _write_text(path: Path | None, content: str) -> None:
     if path is None:
         return
     try:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        path.write_text(content, encoding="utf-8")
     except OSError as error:
         raise SkyfixError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-def _training_line(step: int, steps: int, loss: float, validation: float | None) -> None:
-    if step % 50 == 0 or step == steps:
-        held_out = "" if validation is None else f", validation {validation:.3f}"
-        print(f"step {step}/{steps}: loss {loss:.3f}{held_out}", file=sys.stderr)
 
 
 def main() -> None:

@@ -1,39 +1,46 @@
 """Single-shot evaluation: each scan by itself from a start that is off by up to so much, beside the prior's own score.
 
 Every frame gets a box around its true pose, displaced by a seeded offset drawn uniformly from the box; the matcher
-searches that box and answers its best pose, the prior answers the box's centre. Without the prior's line a table says
-little: on 20 m boxes a centre is 15.3 m off on average, and a method that reports the prior's heading looks like one
-that found it.
+searches that box and answers its best pose and a likelihood, the prior answers the box's centre and the box. Without
+the prior's line a table says little: on 20 m boxes a centre is 15.3 m off on average, and a method that reports the
+prior's heading looks like one that found it.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from fusion.arrays import Float32Array, FloatArray
 from fusion.errors import SkyfixError
+from fusion.likelihood import LikelihoodVolume
 from fusion.trajectory import Trajectory
+from learned.calibration import Calibration, sample_map
+from learned.map_raster import MapRaster
 from learned.matcher import MapMatcher, SearchRegion
+from learned.network import NetworkMatcher
+from learned.samples import Sample
 from sequences.drive import STAMP_TOLERANCE_NS
-from sequences.measurement import Measurement
-from sequences.metrics import summarise
 from sequences.sequence import ScanError, Sequence
-from sequences.start import offset_in_box
-from sequences.tables import ERROR_COLUMNS, error_cells
+from sequences.shot_protocol import ShotProtocol
+from sequences.shot_scores import ShotScore, score_prior, score_shot, summarise_shots
 
-_OFFSET_STREAM = 4
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shot:
+    """A scan's true pose, what is searched, and how a matcher of some kind is asked."""
+
+    truth: FloatArray
+    search: SearchRegion
+    ask: Callable[[Any], LikelihoodVolume]
 
 
 def evaluate_single_shot(
-    sequence: Sequence,
-    matchers: Mapping[str, MapMatcher],
-    half_extent_m: float = 20.0,
-    half_heading_deg: float = 10.0,
-    max_frames: int = 200,
-    seed: int = 0,
+    sequence: Sequence, matchers: Mapping[str, MapMatcher], protocol: ShotProtocol | None = None
 ) -> dict[str, Any]:
     """Score matchers on the scans of one sequence.
 
@@ -43,67 +50,118 @@ def evaluate_single_shot(
         With ground truth.
     matchers
         By the name to list them under. All get the same frames and the same starts.
-    half_extent_m, half_heading_deg
-        Half sides of the start's box, metres and degrees; 180 leaves the heading open.
-    max_frames
-        At most so many scans, spread evenly.
-    seed
-        Of the offsets.
+    protocol
+        The starts; None: the defaults.
 
     Returns
     -------
-    `sequence`, `scans_simulated`, `start` and `methods`: {"prior" or a matcher's key: an object as
-    `metrics.summarise` makes it}.
+    `sequence`, `scans_simulated`, `skipped_frames`, `seed`, `max_frames`, `start` and `methods`: {"prior" or a
+    matcher's key: an object as `shot_scores.summarise_shots` makes it}.
 
     Raises
     ------
     SkyfixError
         If there is no ground truth, no scan can be used, or a matcher cannot use the map.
     """
+    protocol = protocol or ShotProtocol()
     truth = sequence.ground_truth
     if truth is None:
         raise SkyfixError(f"{sequence.name}: expected ground truth to evaluate against, found none")
-    half_heading = math.radians(half_heading_deg)
-    chosen = _frames(sequence, truth, max_frames)
+    chosen = _frames(sequence, truth, protocol.max_frames)
     true_poses = truth.interpolate(sequence.stamps_ns[chosen], STAMP_TOLERANCE_NS)
-    rng = np.random.default_rng([seed, _OFFSET_STREAM])
-    centres = true_poses + offset_in_box(half_extent_m, half_heading, rng, len(chosen))
-    answers: dict[str, list[np.ndarray]] = {"prior": [], **{name: [] for name in matchers}}
-    used = []
-    for place, index in enumerate(chosen):
-        try:
-            points = sequence.scan(int(index))
-        except ScanError:
-            continue
-        used.append(place)
-        search = SearchRegion(centres[place], half_extent_m, half_heading)
-        answers["prior"].append(centres[place])
-        for name, matcher in matchers.items():
-            likelihood = matcher.match(points, sequence.ground_z, sequence.map, search)
-            answers[name].append(Measurement(points, search, likelihood, 1.0).best_pose())
-    if not used:
+
+    def shots() -> Iterable[_Shot]:
+        for index, pose, search in zip(chosen, true_poses, protocol.searches(true_poses), strict=True):
+            try:
+                points = sequence.scan(int(index))
+            except ScanError:
+                continue
+            yield _Shot(pose, search, partial(_ask_matcher, points, sequence, search))
+
+    frames, methods = _scored(shots(), matchers)
+    if frames == 0:
         raise SkyfixError(f"{sequence.name}: expected a usable scan, got none in {len(chosen)}")
     return {
         "sequence": sequence.name,
         "scans_simulated": sequence.scans_simulated,
-        "skipped_frames": len(chosen) - len(used),
-        "seed": seed,
-        "start": {"half_extent_m": half_extent_m, "half_heading_deg": half_heading_deg},
-        "methods": {name: summarise(true_poses[used], np.array(poses)) for name, poses in answers.items()},
+        "skipped_frames": len(chosen) - frames,
+        **protocol.stated(),
+        "methods": methods,
     }
 
 
-def markdown_table(evaluations: list[dict[str, Any]]) -> str:
-    """Evaluations as one Markdown table, a line a sequence and method."""
-    header = ["sequence", "method", "frames", *ERROR_COLUMNS, "within 5 m"]
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    for evaluation in evaluations:
-        label = evaluation["sequence"] + (" (scans simulated)" if evaluation["scans_simulated"] else "")
-        for name, summary in evaluation["methods"].items():
-            within = f"{100 * summary['position_recall']['5']:.0f} %"
-            cells = [label, name, str(summary["frames"]), *error_cells(summary), within]
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+def evaluate_samples(
+    name: str, samples: list[Sample], matchers: Mapping[str, NetworkMatcher], protocol: ShotProtocol
+) -> dict[str, Any]:
+    """Score networks on simulated samples; as `evaluate_single_shot`, all of them.
+
+    Parameters
+    ----------
+    name
+        What to call them.
+    samples
+        At least one; their class rasters reach as far as the search and the scans about it do.
+    """
+    if len(samples) == 0:
+        raise SkyfixError(f"{name}: expected at least one sample, got none")
+
+    rasters = [sample_map(sample) for sample in samples]
+    truths = np.array(
+        [
+            [*raster.grid.xy_from_pixel((sample.row, sample.col)), sample.yaw]
+            for raster, sample in zip(rasters, samples, strict=True)
+        ]
+    )
+
+    def shots() -> Iterable[_Shot]:
+        for sample, raster, truth, search in zip(samples, rasters, truths, protocol.searches(truths), strict=True):
+            counts = sample.counts.astype(np.float32)
+            yield _Shot(truth, search, partial(_ask_network, counts, raster, search))
+
+    _, methods = _scored(shots(), matchers)
+    return {"sequence": name, "scans_simulated": True, "skipped_frames": 0, **protocol.stated(), "methods": methods}
+
+
+def _ask_matcher(
+    points: Float32Array, sequence: Sequence, search: SearchRegion, matcher: MapMatcher
+) -> LikelihoodVolume:
+    return matcher.match(points, sequence.ground_z, sequence.map, search)
+
+
+def _ask_network(
+    counts: Float32Array, raster: MapRaster, search: SearchRegion, matcher: NetworkMatcher
+) -> LikelihoodVolume:
+    return matcher.match_counts(counts, raster, search)
+
+
+def _scored(shots: Iterable[_Shot], matchers: Mapping[str, Any]) -> tuple[int, dict[str, Any]]:
+    """Number of shots, and the summary of the prior and of every matcher (empty if there are none)."""
+    truths: list[FloatArray] = []
+    scores: dict[str, list[ShotScore]] = {"prior": [], **{name: [] for name in matchers}}
+    calibrations = {name: _calibration(matcher) for name, matcher in matchers.items()}
+    for shot in shots:
+        truths.append(shot.truth)
+        scores["prior"].append(score_prior(shot.search))
+        for name, matcher in matchers.items():
+            scores[name].append(score_shot(shot.ask(matcher), shot.truth, calibrations[name]))
+    if not truths:
+        return 0, {}
+    sources = {name: _chance_source(calibration) for name, calibration in calibrations.items()}
+    stacked = np.array(truths)
+    return len(truths), {name: summarise_shots(stacked, found, sources.get(name)) for name, found in scores.items()}
+
+
+def _calibration(matcher: Any) -> Calibration | None:
+    """A matcher's calibration if its confidence was fitted."""
+    calibration = getattr(matcher, "calibration", None)
+    if not isinstance(calibration, Calibration):
+        return None
+    fitted = (calibration.confidence_slope, calibration.confidence_intercept) != (1.0, 0.0)
+    return calibration if fitted else None
+
+
+def _chance_source(calibration: Calibration | None) -> str:
+    return "peak mass" if calibration is None else "calibrated peak mass"
 
 
 def _frames(sequence: Sequence, truth: Trajectory, max_frames: int) -> np.ndarray:

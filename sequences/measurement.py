@@ -41,14 +41,18 @@ class Measurement:
         return self.likelihood.modes(k).tempered(self.temperature)
 
     def best_pose(self) -> FloatArray:
-        """The matcher's own answer (3,): the highest cell, refined below the cell by the mean over its neighbours."""
-        volume = self.likelihood
-        rows, cols, bins = volume.log_prob.shape
-        row, col, yaw_bin = np.unravel_index(int(np.argmax(volume.log_prob)), volume.log_prob.shape)
-        near_rows = np.clip(row + _NEIGHBOURS, 0, rows - 1)
-        near_cols = np.clip(col + _NEIGHBOURS, 0, cols - 1)
-        near_bins = yaw_bin + _NEIGHBOURS
-        mass = np.exp(volume.log_prob[np.ix_(near_rows, near_cols, near_bins % bins)] - volume.log_prob.max())
-        grid_rows, grid_cols, grid_bins = np.meshgrid(near_rows + 0.5, near_cols + 0.5, near_bins, indexing="ij")
-        centre = [float(np.average(values, weights=mass)) for values in (grid_rows, grid_cols, grid_bins)]
-        return np.array([*volume.grid.xy_from_pixel(centre[:2]), se2.wrap(centre[2] * se2.TWO_PI / bins)])
+        """The matcher's own answer, see `best_pose`."""
+        return best_pose(self.likelihood)
+
+
+def best_pose(volume: LikelihoodVolume) -> FloatArray:
+    """The best pose (3,) of a likelihood: the highest cell, refined below the cell by the mean over its neighbours."""
+    rows, cols, bins = volume.log_prob.shape
+    row, col, yaw_bin = np.unravel_index(int(np.argmax(volume.log_prob)), volume.log_prob.shape)
+    near_rows = np.clip(row + _NEIGHBOURS, 0, rows - 1)
+    near_cols = np.clip(col + _NEIGHBOURS, 0, cols - 1)
+    near_bins = yaw_bin + _NEIGHBOURS
+    mass = np.exp(volume.log_prob[np.ix_(near_rows, near_cols, near_bins % bins)] - volume.log_prob.max())
+    grid_rows, grid_cols, grid_bins = np.meshgrid(near_rows + 0.5, near_cols + 0.5, near_bins, indexing="ij")
+    centre = [float(np.average(values, weights=mass)) for values in (grid_rows, grid_cols, grid_bins)]
+    return np.array([*volume.grid.xy_from_pixel(centre[:2]), se2.wrap(centre[2] * se2.TWO_PI / bins)])

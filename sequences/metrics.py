@@ -6,6 +6,7 @@ errors come from `vehicle_frame_errors` alone.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,10 @@ def map_frame_errors(truth: NDArray[np.float64], estimate: NDArray[np.float64]) 
 
 
 def summarise(
-    truth: NDArray[np.float64], estimate: NDArray[np.float64], covariances: NDArray[np.float64] | None = None
+    truth: NDArray[np.float64],
+    estimate: NDArray[np.float64],
+    covariances: NDArray[np.float64] | None = None,
+    thresholds: Sequence[int] = RECALL_THRESHOLDS,
 ) -> dict[str, Any]:
     """One method's object in `metrics.json`.
 
@@ -74,11 +78,15 @@ def summarise(
         Poses (N, 3) of the same frames, N > 0.
     covariances
         (N, 3, 3) of (x, y, yaw) on the axes of the map; adds `nees` and `ellipse95`.
+    thresholds
+        Metres and degrees of the recalls.
 
-    Returns ------- `position_error_m`, `heading_error_deg`, `position_recall`, `lateral_recall`,
-    `longitudinal_recall`, `heading_recall` (fractions of frames below 1, 3, 5 metres or degrees), `frames`; with
-    covariances also `nees` = {mean, dof: 3, coverage95} of (x, y, yaw) and `ellipse95`, the fraction of frames with
-    the true position in the 95 % ellipse (2 degrees of freedom).
+    Returns
+    -------
+    `position_error_m`, `heading_error_deg`, `position_recall`, `lateral_recall`, `longitudinal_recall`,
+    `heading_recall` (fractions of frames below each threshold), `frames`; with covariances also `nees` = {mean,
+    dof: 3, coverage95} of (x, y, yaw) and `ellipse95`, the fraction of frames with the true position in the 95 %
+    ellipse (2 degrees of freedom).
     """
     if len(truth) == 0:
         raise SkyfixError("metrics: expected at least one frame, got none")
@@ -97,10 +105,10 @@ def summarise(
             "median": _rounded(np.median(heading_deg)),
             "max": _rounded(heading_deg.max()),
         },
-        "position_recall": _recall(position),
-        "lateral_recall": _recall(np.abs(lateral)),
-        "longitudinal_recall": _recall(np.abs(longitudinal)),
-        "heading_recall": _recall(heading_deg),
+        "position_recall": _recall(position, thresholds),
+        "lateral_recall": _recall(np.abs(lateral), thresholds),
+        "longitudinal_recall": _recall(np.abs(longitudinal), thresholds),
+        "heading_recall": _recall(heading_deg, thresholds),
         "frames": len(truth),
     }
     if covariances is not None:
@@ -151,8 +159,8 @@ def after_first_quarter(truth: Trajectory, estimate: Trajectory) -> Trajectory:
     return Trajectory(estimate.stamp_ns[keep], estimate.poses[keep], covariances, estimate.frame_id)
 
 
-def _recall(magnitudes: FloatArray) -> dict[str, float]:
-    return {str(limit): _rounded(np.mean(magnitudes < limit)) for limit in RECALL_THRESHOLDS}
+def _recall(magnitudes: FloatArray, thresholds: Sequence[int]) -> dict[str, float]:
+    return {str(limit): _rounded(np.mean(magnitudes < limit)) for limit in thresholds}
 
 
 def _rounded(value: np.floating[Any] | float) -> float:

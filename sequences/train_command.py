@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -33,13 +33,12 @@ from sequences.figures.loss_curve import draw_loss_curve
 from sequences.figures.reliability import reliability_figure
 from sequences.figures.style import png_bytes
 from sequences.figures.validation import validation_figure
+from sequences.held_out import HELD_OUT_HALF_EXTENT_M, calibration_settings, validation_settings
 from sequences.osm import MapFeatures, read_osm
 from sequences.train_budget import steps_within
 from sequences.train_config import RESOLVED_FILE, TrainConfig, first_difference, read_config, write_config
-from sequences.training_data import SimulatedSamples, SimulationSettings
+from sequences.training_data import SimulatedSamples
 
-_VALIDATION_SEED_OFFSET = 1_000_000
-_HELD_OUT_HALF_EXTENT_M = 20.0
 _PICTURES = 4
 
 
@@ -116,7 +115,7 @@ def train_from_config(
         extracts = [(find_extract(name, data_dir), weight) for name, weight in config.extracts.items()]
         source = SimulatedSamples(extracts, config.simulation, cache_dir / "training")
         held_out = [(find_extract(config.validation_extract, data_dir), 1.0)]
-        validation = SimulatedSamples(held_out, _validation_settings(config), cache_dir / "validation")
+        validation = SimulatedSamples(held_out, validation_settings(config), cache_dir / "validation")
         config = _settled(config, out_dir, options.minutes, source, validation, processes)
         if processes.is_first:
             write_config(config, out_dir / RESOLVED_FILE)
@@ -133,7 +132,7 @@ def train_from_config(
         )
         path = out_dir / f"{config.training.network.name}.safetensors"
         if processes.is_first:
-            far = SimulatedSamples(held_out, _calibration_settings(config), cache_dir / "calibration")
+            far = SimulatedSamples(held_out, calibration_settings(config), cache_dir / "calibration")
             command = " ".join(["skyfix train", config_path.name, *(f"--set {o}" for o in options.overrides)])
             if options.initial is not None:
                 command += f" --initial {options.initial.name}"
@@ -151,7 +150,7 @@ def calibrated(
     fitted on.
     """
     matcher = architecture.matcher(net, Calibration())
-    volumes, truths = match_samples(matcher, samples, _HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
+    volumes, truths = match_samples(matcher, samples, HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
     calibration = fit_calibration(volumes, truths, architecture.factored)
     ready = [calibration.applied(volume) for volume in volumes]
     best = np.array([volume.modes(1).means[0] for volume in ready])
@@ -206,33 +205,13 @@ def _settled(
     return config.with_steps(steps)
 
 
-def _validation_settings(config: TrainConfig) -> SimulationSettings:
-    return replace(
-        config.simulation,
-        samples=config.validation_samples,
-        samples_per_area=4,
-        seed=config.simulation.seed + _VALIDATION_SEED_OFFSET,
-    )
-
-
-def _calibration_settings(config: TrainConfig) -> SimulationSettings:
-    reach = config.matching_reach_m
-    return replace(
-        _validation_settings(config),
-        samples=config.calibration_samples,
-        bev_half_extent_m=reach,
-        sample_px=4 * round(reach + 2 * _HELD_OUT_HALF_EXTENT_M + 2),
-        area_half_extent_m=config.simulation.scan_half_extent_m + reach + 44.0,
-    )
-
-
 def _validation_view(config: TrainConfig, validation: SimulatedSamples, folder: Path) -> ValidationView:
     """Draws the first held-out samples at every validation."""
 
     def view(step: int, net: LocalizationNet) -> None:
         matcher = config.training.network.architecture.matcher(on_cpu(net), Calibration())
         samples = [validation[index] for index in range(min(_PICTURES, len(validation)))]
-        volumes, truths = match_samples(matcher, samples, _HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
+        volumes, truths = match_samples(matcher, samples, HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
         folder.mkdir(exist_ok=True)
         for number, (sample, volume, truth) in enumerate(zip(samples, volumes, truths, strict=True)):
             density, best = log_density(sample.counts.astype(np.float32)), volume.modes(1).means[0]

@@ -193,7 +193,7 @@ def test_evaluate_prints_the_prior_beside_every_matcher(
     done = skyfix(capsys, monkeypatch, *arguments, "--json", str(tmp_path / "shots.json"), "--max-frames", "15")
     assert done.code == 0
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in done.out.splitlines()]
-    assert [row[1] for row in rows[2:]] == ["prior", "sharp", "blunt"]
+    assert [row[2] for row in rows[2:]] == ["prior", "sharp", "blunt"]
     assert {len(row) for row in rows} == {len(rows[0])}
     (evaluation,) = json.loads((tmp_path / "shots.json").read_text())
     assert evaluation["skipped_frames"] == 1
@@ -201,6 +201,30 @@ def test_evaluate_prints_the_prior_beside_every_matcher(
     assert mean["sharp"] < 0.6 < mean["blunt"] < mean["prior"]
     assert evaluation["methods"]["prior"]["frames"] == 14
     assert done.out == skyfix(capsys, monkeypatch, *arguments, "--max-frames", "15").out
+
+
+def test_evaluate_takes_several_starts_in_one_call(
+    made_drive: MadeDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(made_drive.truth.poses))
+    few = ("evaluate", str(made_drive.path), "--matcher", "one", "--max-frames", "3")
+    table = tmp_path / "table.md"
+    both = skyfix(
+        capsys, monkeypatch, *few, "--half-heading-deg", "10", "--half-heading-deg", "180", "--markdown", str(table)
+    )
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in both.out.splitlines()]
+    assert [row[1] for row in rows[2:]] == ["±20 m, ±10°"] * 2 + ["±20 m, any heading"] * 2
+    assert both.out in table.read_text()
+    unknown = skyfix(capsys, monkeypatch, *few, "--heading-unknown")
+    assert unknown.out.splitlines()[2:] == both.out.splitlines()[4:]
+    for option, value, message in (
+        ("--half-heading-deg", "200", "half heading: expected above 0 and at most 180 degrees, got 200"),
+        ("--half-extent", "0", "half extent: expected above 0 m, got 0"),
+        ("--max-frames", "0", "max frames: expected 1 or more, got 0"),
+    ):
+        refused = skyfix(capsys, monkeypatch, *few, option, value)
+        assert refused.code == 2
+        assert refused.err == f"skyfix: error: {message}\n"
 
 
 def test_demo_tracks_the_demo_sequence(

@@ -97,6 +97,8 @@ def test_the_weights_of_losses_are_what_they_say() -> None:
         less = terms(without(name))
         assert term not in less
         assert less["total"] == pytest.approx(full["total"] - 0.1 * full[term], rel=1e-5)
+    mean_alone = terms(replace(FULL, likelihood_weight=0.0))
+    assert mean_alone["total"] == pytest.approx(full["total"] - full["nll"], rel=1e-4)
 
 
 @pytest.mark.parametrize("name", ["none", *SWITCHES])
@@ -196,6 +198,8 @@ def test_bad_images_are_refused() -> None:
         ({"attention_heads": 3}, "attention_heads: expected a divisor of 8, got 3"),
         ({"contrastive_weight": -1.0}, "contrastive_weight: expected zero or more"),
         ({"regression_weight": float("nan")}, "regression_weight: expected zero or more"),
+        ({"likelihood_weight": -0.5}, "likelihood_weight: expected zero or more, got -0.5"),
+        ({"likelihood_weight": 0.0, "regression_weight": 0.0}, "a likelihood_weight or a regression_weight above zero"),
     ],
 )
 def test_bad_settings_are_refused(change: dict[str, float], message: str) -> None:

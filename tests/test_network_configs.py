@@ -7,6 +7,7 @@ import yaml
 
 import learned
 from learned.architectures import ARCHITECTURES
+from sequences.ablation_config import read_ablation
 from sequences.train_config import read_config
 
 FOLDER = Path(learned.__file__).parent
@@ -36,3 +37,47 @@ def test_a_configuration_names_every_setting_once(name: str) -> None:
     stated = yaml.safe_load((FOLDER / "configs" / f"{name}.yaml").read_text())["training"]["network"]
     known = set(ARCHITECTURES[name].settings_type.__dataclass_fields__)
     assert set(stated) - {"architecture"} >= known - {"bev", "quadrature"}
+
+
+@pytest.mark.parametrize(
+    ("name", "architecture"), [("translocnet", "translocnet"), ("translocnet_compact", "translocnet-compact")]
+)
+def test_the_configurations_of_translocnet_are_of_the_paper_and_on_the_samples_of_rotmatch(
+    name: str, architecture: str
+) -> None:
+    config, shipped = (
+        read_config(FOLDER / "configs" / f"{name}.yaml"),
+        read_config(FOLDER / "weights" / "rotmatch.yaml"),
+    )
+    network, augmentation = config.training.network, config.training.augmentation
+    assert network.name == architecture
+    assert network.settings == ARCHITECTURES[architecture].settings_type()
+    assert (network.settings.loss.regression, network.settings.loss.contrastive) == (2.0, 0.1)
+    assert (augmentation.rotate, augmentation.rotate_deg, augmentation.half_heading_deg) == (0.7, 60.0, 10.0)
+    assert config.simulation == shipped.simulation
+    assert config.extracts == shipped.extracts
+
+
+@pytest.mark.parametrize(
+    "name", ["ablation_hybrid", "ablation_translocnet", "sensitivity_hybrid", "sensitivity_translocnet"]
+)
+def test_every_line_of_an_ablation_is_a_network_of_its_own(name: str) -> None:
+    ablation = read_ablation(FOLDER / "configs" / f"{name}.yaml")
+    base = read_config(ablation.base)
+    settings = [variant.config.training.network for variant in ablation.variants]
+    assert len({repr(each) for each in settings}) == len(settings)
+    assert sum(each == base.training.network for each in settings) == 1  # "full", or the grid's point of the paper
+    for variant in ablation.variants:
+        rest = variant.config.model_copy(update={"training": base.training})
+        assert rest == base
+        assert len(variant.changes) <= 4
+
+
+def test_the_sensitivity_grid_is_the_papers() -> None:
+    ablation = read_ablation(FOLDER / "configs" / "sensitivity_translocnet.yaml")
+    assert [list(values) for values in ablation.grid.values()] == [[0.5, 1.0, 2.0, 4.0], [0.05, 0.1, 0.2, 0.5]]
+    weights = {
+        (v.config.training.network.settings.loss.regression, v.config.training.network.settings.loss.contrastive)
+        for v in ablation.variants
+    }
+    assert len(weights) == 16

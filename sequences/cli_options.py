@@ -1,0 +1,69 @@
+"""What the commands of `skyfix` have in common: options, opening a sequence, the line of a training step."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from sequences.sequence import Sequence
+
+MatcherOption = Annotated[
+    str,
+    typer.Option(
+        help="Matches scans with the map: rotmatch (learned, shipped), geometric (no learning), a .safetensors file "
+        "or a folder of `skyfix export`.",
+        metavar="NAME|FILE",
+    ),
+]
+BackendOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Runs rotmatch's encoders: torch, openvino, openvino-bf16, openvino-int8, onnxruntime or "
+        "onnxruntime-int8; those of int8 need a folder of `skyfix export --int8`. Default: torch, or for a folder the "
+        "first that is installed.",
+        metavar="NAME",
+    ),
+]
+SeedOption = Annotated[int, typer.Option(help="Of start, particles and simulated scans. Same seed, same numbers.")]
+OutOption = Annotated[
+    Path | None, typer.Option(help="Run directory to write. Default: runs/SEQUENCE-ODOMETRY-seedN.", metavar="DIR")
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in the directory.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+HeadingUnknownOption = Annotated[
+    bool, typer.Option("--heading-unknown", help="The start's heading may be anything, as with --half-heading-deg 180.")
+]
+HalfExtentOption = Annotated[
+    float, typer.Option(help="The start is known to within a square of this half side, metres.", metavar="M")
+]
+HalfHeadingOption = Annotated[
+    float, typer.Option(help="The start's heading is known to within this, degrees; at most 180.", metavar="DEG")
+]
+HalfHeadingsOption = Annotated[
+    list[float] | None,
+    typer.Option(
+        help="As for track; give it several times to compare starts, 180 for an unknown heading. Default: 10.",
+        metavar="DEG",
+    ),
+]
+MaxFramesOption = Annotated[int, typer.Option(help="Most scans of a sequence, spread evenly.", metavar="N")]
+JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")]
+
+
+def open_sequence(path: Path, seed: int) -> Sequence:
+    """The sequence in a folder; 'demo' is the embedded one."""
+    from sequences.demo import DemoSequence
+    from sequences.folder import FolderSequence
+
+    return DemoSequence(seed) if path == Path("demo") else FolderSequence(path, seed)
+
+
+def training_line(step: int, steps: int, loss: float, validation: float | None) -> None:
+    """Show a training step on standard error, now and then."""
+    if step % 50 == 0 or step == steps:
+        held_out = "" if validation is None else f", validation {validation:.3f}"
+        print(f"step {step}/{steps}: loss {loss:.3f}{held_out}", file=sys.stderr)
