@@ -54,6 +54,9 @@ HalfExtentOption = Annotated[
 HalfHeadingOption = Annotated[
     float, typer.Option(help="The start's heading is known to within this, degrees; at most 180.", metavar="DEG")
 ]
+PickleOption = Annotated[
+    bool, typer.Option("--allow-pickle", help="Unpickle scans (CARLA's), which runs code of whoever made the files.")
+]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")]
 
 
@@ -80,7 +83,11 @@ def demo(
 )
 def track(
     sequence: Annotated[
-        Path, typer.Argument(help="Folder with map.json, odometry/*.tum, scans/ (see the README).", metavar="SEQUENCE")
+        Path,
+        typer.Argument(
+            help="Folder with map.json, odometry/*.tum, scans/, or a drive of KITTI or CARLA (see the README).",
+            metavar="SEQUENCE",
+        ),
     ],
     odometry: Annotated[
         str | None,
@@ -114,6 +121,7 @@ def track(
         float, typer.Option(help="How far off the map draws things, standard deviation, metres.", metavar="M")
     ] = 0.4,
     particles: Annotated[int, typer.Option(help="How many particles the filter has.", metavar="N")] = 10_000,
+    allow_pickle: PickleOption = False,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -121,10 +129,10 @@ def track(
 
     Writes a run directory (metrics.json, report.html, trajectories) and prints the errors, when there is ground truth.
     """
-    from sequences.folder import FolderSequence
+    from sequences.registry import OpenOptions, open_sequence
     from sequences.track_settings import TrackSettings
 
-    opened = FolderSequence(sequence, seed)
+    opened = open_sequence(sequence, OpenOptions(seed, allow_pickle))
     settings = TrackSettings(
         odometry=odometry or default_odometry(opened),
         seed=seed,
@@ -142,7 +150,9 @@ def track(
 
 @app.command(epilog="Example: `skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`")
 def evaluate(
-    sequences: Annotated[list[Path], typer.Argument(help="Sequence folders with ground truth.", metavar="SEQUENCE")],
+    sequences: Annotated[
+        list[Path], typer.Argument(help="Drives with ground truth, lists of frames.", metavar="SEQUENCE")
+    ],
     matcher: Annotated[
         list[str] | None,
         typer.Option(
@@ -154,29 +164,45 @@ def evaluate(
     heading_unknown: HeadingUnknownOption = False,
     max_frames: Annotated[int, typer.Option(help="Most scans of a sequence, spread evenly.", metavar="N")] = 200,
     seed: SeedOption = 0,
+    allow_pickle: PickleOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Score single shots: each scan by itself from a start that is off, beside the prior's own score."""
+    """Score single shots: each scan by itself from a start that is off, beside the prior's own score.
+
+    Frames of a list (KITTI + aerial) start where the list says, whatever the options.
+    """
     from learned.matcher import load_matcher
-    from sequences.demo import DemoSequence
-    from sequences.evaluate import evaluate_single_shot, markdown_table
-    from sequences.folder import FolderSequence
+    from sequences.evaluate import evaluate_frames, evaluate_single_shot, markdown_table
+    from sequences.frame_set import FrameSet
+    from sequences.registry import OpenOptions, open_any
 
     half_heading = 180.0 if heading_unknown else half_heading_deg
     loaded = {name: load_matcher(name) for name in matcher or ["rotmatch", "geometric"]}
-    evaluations = [
-        evaluate_single_shot(
-            DemoSequence(seed) if path == Path("demo") else FolderSequence(path, seed),
-            loaded,
-            half_extent,
-            half_heading,
-            max_frames,
-            seed,
-        )
-        for path in sequences
-    ]
+    evaluations = []
+    for path in sequences:
+        opened = open_any(path, OpenOptions(seed, allow_pickle))
+        if isinstance(opened, FrameSet):
+            evaluations.append(evaluate_frames(opened, loaded, max_frames))
+        else:
+            evaluations.append(evaluate_single_shot(opened, loaded, half_extent, half_heading, max_frames, seed))
     typer.echo(markdown_table(evaluations), nl=False)
     _write_json(json_file, evaluations)
+
+
+@app.command(epilog="Example: `skyfix convert KITTI/raw_data/2011_09_26/2011_09_26_drive_0013_sync drives/kitti_13`")
+def convert(
+    source: Annotated[Path, typer.Argument(help="Any drive that track opens.", metavar="SRC")],
+    target: Annotated[Path, typer.Argument(help="New or empty folder to write.", metavar="DIR")],
+    seed: SeedOption = 0,
+    allow_pickle: PickleOption = False,
+) -> None:
+    """Write a drive in the folder format: map, scans, ground truth and every odometry."""
+    from sequences.folder import write_folder
+    from sequences.registry import OpenOptions, open_sequence
+
+    opened = open_sequence(source, OpenOptions(seed, allow_pickle))
+    write_folder(target, opened)
+    typer.echo(f"{target}: {len(opened.stamps_ns)} scans of {opened.name}")
 
 
 @app.command(

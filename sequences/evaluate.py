@@ -9,15 +9,20 @@ that found it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
+from learned.map_raster import MapRaster
 from learned.matcher import MapMatcher, SearchRegion
 from sequences.drive import STAMP_TOLERANCE_NS
+from sequences.frame_set import FrameSet, covering_half_extent_m
 from sequences.measurement import Measurement
 from sequences.metrics import summarise
 from sequences.sequence import ScanError, Sequence
@@ -52,7 +57,7 @@ def evaluate_single_shot(
 
     Returns
     -------
-    `sequence`, `scans_simulated`, `start` and `methods`: {"prior" or a matcher's key: an object as
+    `sequence`, `scans_simulated`, `skipped_frames`, `seed`, `start` and `methods`: {"prior" or a matcher's key: an object as
     `metrics.summarise` makes it}.
 
     Raises
@@ -68,28 +73,85 @@ def evaluate_single_shot(
     true_poses = truth.interpolate(sequence.stamps_ns[chosen], STAMP_TOLERANCE_NS)
     rng = np.random.default_rng([seed, _OFFSET_STREAM])
     centres = true_poses + offset_in_box(half_extent_m, half_heading, rng, len(chosen))
-    answers: dict[str, list[np.ndarray]] = {"prior": [], **{name: [] for name in matchers}}
-    used = []
-    for place, index in enumerate(chosen):
-        try:
-            points = sequence.scan(int(index))
-        except ScanError:
+
+    def shots() -> Iterator[_Shot | None]:
+        for place, index in enumerate(chosen):
+            search = SearchRegion(centres[place], half_extent_m, half_heading)
+            try:
+                points = sequence.scan(int(index))
+            except ScanError:
+                yield None
+            else:
+                yield _Shot(points, sequence.map, search, true_poses[place])
+
+    start = {"half_extent_m": half_extent_m, "half_heading_deg": half_heading_deg}
+    return {**_scored(sequence, shots(), matchers), "seed": seed, "start": start}
+
+
+def evaluate_frames(frames: FrameSet, matchers: Mapping[str, MapMatcher], max_frames: int = 200) -> dict[str, Any]:
+    """Score matchers on single frames, each from its listed start on its own map.
+
+    The square that is searched holds the protocol's box, which lies on the axes of the vehicle.
+
+    Parameters
+    ----------
+    frames, matchers, max_frames
+        As for `evaluate_single_shot`, which says what is returned; `seed` is None.
+
+    Raises
+    ------
+    SkyfixError
+        If a frame's map or pose cannot be read, no scan can be used, or a matcher cannot use a map.
+    """
+    half_extent_m = covering_half_extent_m(frames.half_extent_m, frames.half_heading_deg)
+
+    def shots() -> Iterator[_Shot | None]:
+        for index in _spread(np.arange(len(frames)), max_frames):
+            frame = frames.frame(int(index))
+            search = SearchRegion(frame.start, half_extent_m, math.radians(frames.half_heading_deg))
+            try:
+                points = frames.scan(int(index))
+            except ScanError:
+                yield None
+            else:
+                yield _Shot(points, frame.map, search, frame.true_pose)
+
+    start = {"half_extent_m": frames.half_extent_m, "half_heading_deg": frames.half_heading_deg}
+    return {**_scored(frames, shots(), matchers), "seed": None, "start": start}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shot:
+    """One usable scan, where it is looked for and where it is."""
+
+    points: NDArray[np.float32]
+    map: MapRaster
+    search: SearchRegion
+    true_pose: FloatArray
+
+
+def _scored(
+    source: Sequence | FrameSet, shots: Iterable[_Shot | None], matchers: Mapping[str, MapMatcher]
+) -> dict[str, Any]:
+    answers: dict[str, list[FloatArray]] = {"prior": [], **{name: [] for name in matchers}}
+    true_poses: list[FloatArray] = []
+    skipped = 0
+    for shot in shots:
+        if shot is None:
+            skipped += 1
             continue
-        used.append(place)
-        search = SearchRegion(centres[place], half_extent_m, half_heading)
-        answers["prior"].append(centres[place])
+        true_poses.append(shot.true_pose)
+        answers["prior"].append(shot.search.centre)
         for name, matcher in matchers.items():
-            likelihood = matcher.match(points, sequence.ground_z, sequence.map, search)
-            answers[name].append(Measurement(points, search, likelihood, 1.0).best_pose())
-    if not used:
-        raise SkyfixError(f"{sequence.name}: expected a usable scan, got none in {len(chosen)}")
+            likelihood = matcher.match(shot.points, source.ground_z, shot.map, shot.search)
+            answers[name].append(Measurement(shot.points, shot.search, likelihood, 1.0).best_pose())
+    if not true_poses:
+        raise SkyfixError(f"{source.name}: expected a usable scan, got none in {skipped}")
     return {
-        "sequence": sequence.name,
-        "scans_simulated": sequence.scans_simulated,
-        "skipped_frames": len(chosen) - len(used),
-        "seed": seed,
-        "start": {"half_extent_m": half_extent_m, "half_heading_deg": half_heading_deg},
-        "methods": {name: summarise(true_poses[used], np.array(poses)) for name, poses in answers.items()},
+        "sequence": source.name,
+        "scans_simulated": source.scans_simulated,
+        "skipped_frames": skipped,
+        "methods": {name: summarise(np.array(true_poses), np.array(poses)) for name, poses in answers.items()},
     }
 
 
@@ -112,6 +174,10 @@ def _frames(sequence: Sequence, truth: Trajectory, max_frames: int) -> np.ndarra
     covered = np.flatnonzero((stamps >= first - STAMP_TOLERANCE_NS) & (stamps <= last + STAMP_TOLERANCE_NS))
     if len(covered) == 0:
         raise SkyfixError(f"{sequence.name}: expected ground truth that overlaps the scans in time, got none")
-    if len(covered) <= max_frames:
-        return covered
-    return covered[np.linspace(0, len(covered) - 1, max_frames).round().astype(int)]
+    return _spread(covered, max_frames)
+
+
+def _spread(indices: np.ndarray, most: int) -> np.ndarray:
+    if len(indices) <= most:
+        return indices
+    return indices[np.linspace(0, len(indices) - 1, most).round().astype(int)]

@@ -108,14 +108,24 @@ def rigid(rotation: FloatArray, translation: FloatArray, label: str) -> FloatArr
         If the counts are wrong or the nine numbers are no rotation.
     """
     if rotation.size != 9 or translation.size != 3:
-        raise SkyfixError(f"{label}: expected a rotation of 9 numbers and a translation of 3, got {rotation.size} and "
-                          f"{translation.size}")
+        raise SkyfixError(
+            f"{label}: expected a rotation of 9 numbers and a translation of 3, got {rotation.size} and "
+            f"{translation.size}"
+        )
     matrix = np.eye(4)
     matrix[:3, :3] = rotation.reshape(3, 3)
     matrix[:3, 3] = translation
     turn = matrix[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > _ORTHOGONAL_WITHIN or np.linalg.det(turn) < 0.0:
         raise SkyfixError(f"{label}: expected a rotation matrix, got {rotation.round(3).tolist()}")
+    return matrix
+
+
+def inverse(target_from_source: FloatArray) -> FloatArray:
+    """source_from_target of a rigid (4, 4) matrix."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = target_from_source[:3, :3].T
+    matrix[:3, 3] = -target_from_source[:3, :3].T @ target_from_source[:3, 3]
     return matrix
 
 

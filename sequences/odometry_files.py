@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from fusion.errors import SkyfixError
@@ -27,7 +28,7 @@ class OdometryFiles:
         self._label = label
         self._readers: dict[str, Callable[[], Trajectory]] = dict(made or {})
         for file in folder.glob("odometry/*.tum"):
-            self._readers[file.stem] = lambda file=file: read_tum(file, frame_id=file.stem)
+            self._readers[file.stem] = partial(read_tum, file, file.stem)
 
     @property
     def names(self) -> tuple[str, ...]:

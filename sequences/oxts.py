@@ -2,7 +2,7 @@
 
     oxts/data/NNNNNNNNNN.txt    one line of 30 numbers: latitude, longitude (degrees), altitude (m), roll, pitch, yaw
                                 (rad; yaw 0 = east, counter-clockwise), velocities north, east, forward, left, up (m/s),
-                                accelerations, rates about x, y, z and about forward, left, up (rad/s), accuracies, modes
+                                accelerations, rates about x, y, z and forward, left, up (rad/s), accuracies, modes
     oxts/timestamps.txt         a date and time for every number
 
 The local frame is that of `sequences.osm.local_projection`: transverse Mercator about an origin with scale 1, x east,
@@ -24,6 +24,7 @@ from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from sequences.kitti_files import read_date_times, read_rows
 from sequences.osm import local_projection
+from sequences.point_file import frame_number
 
 COLUMNS = 30
 _FORWARD, _LEFT, _RATE_UP = 8, 9, 22
@@ -89,16 +90,11 @@ def read_record(file: Path) -> FloatArray:
     """One record (1, 30)."""
     record = read_rows(file, COLUMNS)
     if len(record) != 1 or abs(record[0, 0]) > 90.0 or abs(record[0, 1]) > 180.0:
-        raise SkyfixError(f"{file}: expected one record that begins with latitude and longitude, got {len(record)} "
-                          f"lines, {record[0, 0]:g}, {record[0, 1]:g}")
+        raise SkyfixError(
+            f"{file}: expected one record that begins with latitude and longitude, got {len(record)} "
+            f"lines, {record[0, 0]:g}, {record[0, 1]:g}"
+        )
     return record
-
-
-def frame_number(file: Path) -> int:
-    """The number that a file is named by; `SkyfixError` when it is named otherwise."""
-    if not (file.stem.isascii() and file.stem.isdigit()):
-        raise SkyfixError(f"{file}: expected a file named by a frame's number, got {file.name}")
-    return int(file.stem)
 
 
 def map_from_imu(records: FloatArray, origin_lat_lon: tuple[float, float]) -> FloatArray:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.errors import SkyfixError
 from sequences.sequence import SCAN_COLUMNS, ScanError, checked_points
 
 _BYTES_PER_POINT = SCAN_COLUMNS * 4
@@ -31,3 +32,10 @@ def read_points(path: Path) -> NDArray[np.float32]:
         )
     points = np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(-1, SCAN_COLUMNS)
     return checked_points(points, f"scan {path.name}")
+
+
+def frame_number(file: Path) -> int:
+    """The number that a file is named by; `SkyfixError` when it is named otherwise."""
+    if not (file.stem.isascii() and file.stem.isdigit()):
+        raise SkyfixError(f"{file}: expected a file named by a frame's number, got {file.name}")
+    return int(file.stem)
