@@ -57,8 +57,8 @@ def evaluate_single_shot(
 
     Returns
     -------
-    `sequence`, `scans_simulated`, `skipped_frames`, `seed`, `start` and `methods`: {"prior" or a matcher's key: an object as
-    `metrics.summarise` makes it}.
+    `sequence`, `scans_simulated`, `skipped_frames`, `seed`, `start` and `methods`: {"prior" or a matcher's key: an
+    object as `metrics.summarise` makes it}.
 
     Raises
     ------

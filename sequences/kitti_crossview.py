@@ -13,8 +13,8 @@ The protocol (Shi and Li, "Beyond cross-view image retrieval: highly accurate ve
 image", CVPR 2022, and the code released with it): the satellite image is turned so that the heading points east, moved
 by the camera's place (1.08 m ahead of the GPS and 0.26 m to its right), moved again so that the camera appears
 20 sx m ahead and 20 sy m to the left of the centre, turned by 10 theta degrees counter-clockwise about the centre, and
-its middle 512 x 512 px are kept, 0.1958 m each. The middle is the start; so with the true camera pose (p, yaw) the start
-is p - 20 (sx ahead + sy left), headed yaw - 10 theta degrees. Here all of that is one resampling of the original.
+its middle 512 x 512 px are kept, 0.1958 m each. The middle is the start; so with the true camera pose (p, yaw) the
+start is p - 20 (sx ahead + sy left), headed yaw - 10 theta degrees. Here all of that is one resampling of the original.
 Maps are pictures without classes. The body frame is the Velodyne's, of which the start is as far off as the camera's.
 """
 
