@@ -12,7 +12,8 @@
 photograph, y towards its top; 5000 px give 11.8 px/m on the ground. Poses are computed from the measurements and must
 agree with dump_gt.json where there is one. The LiDAR sits at (1.3, 0, 2.5) m on the vehicle and is turned by -90
 degrees, and CARLA's frames are left-handed: its x is to the vehicle's left and its y ahead. The body frame is at the
-LiDAR, on the vehicle's axes. Unpickling runs code of the file's author, so it is done on request only (`--allow-pickle`).
+LiDAR, on the vehicle's axes. Unpickling runs code of the file's author, so it is done on request
+only (`--allow-pickle`).
 Source: the code released with Guan et al., "AGL-Net: aerial-ground cross-modal global localization with varying
 scales", 2024, and CARLA's sensor reference.
 """

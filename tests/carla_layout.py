@@ -1,4 +1,4 @@
-"""AGL-Net's CARLA layout on disk, with landmarks planted in the world and the ground truth as its authors compute it."""
+"""AGL-Net's CARLA layout on disk, with planted landmarks and the ground truth as its authors compute it."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def write_scan(route: Path, index: int, points: np.ndarray, pickled: bool) -> No
 
 
 def ground_truth(index: int) -> dict[str, object]:
-    """uv_gt and theta_gt through the chain of transforms that the authors publish: LiDAR, vehicle, world, photograph."""
+    """uv_gt and theta_gt through the authors' chain of transforms: LiDAR, vehicle, world, photograph."""
     ego, photograph = measurement(index), measurement(int(PHOTOGRAPH))
     mirrored = np.diag([-1.0, 1.0, -1.0, 1.0])
     ego_from_lidar = np.linalg.inv(_moved(1.3, 0.0, 2.5) @ _turned(np.radians(-90.0)))
