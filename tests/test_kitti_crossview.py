@@ -88,8 +88,8 @@ def test_the_truth_lies_where_the_list_says(listed: Path) -> None:
 def test_the_crop_is_the_published_one(listed: Path) -> None:
     """The protocol step by step (turn, move, move, turn, cut) with an image library."""
     frame_set = KittiCrossview(listed)
-    for index in (0, 4, 7):
-        ahead, left, turn = offsets()[index]
+    compared = 0
+    for index, (ahead, left, turn) in enumerate(offsets()):
         heading_deg = 90.0 - frames()[index].azimuth
         with Image.open(listed.parent / "satmap" / DATE / DRIVE / f"{index:010d}.png") as image:
             turned = image.rotate(-heading_deg, resample=Image.Resampling.BICUBIC)
@@ -103,9 +103,12 @@ def test_the_crop_is_the_published_one(listed: Path) -> None:
         inside = published.sum(axis=-1) > 0  # its two turns each cut the corners off
         assert inside.mean() > 0.8
         assert np.abs(published - ours)[inside].mean() < 0.5
-        spots = [np.argwhere(inside & (picture.max(axis=-1) > 128)) for picture in (published, ours)]
-        assert min(map(len, spots)) > 60  # a landmark is in it
-        np.testing.assert_allclose(spots[1].mean(axis=0), spots[0].mean(axis=0), atol=0.5)
+        for colour in COLOURS:
+            spots = [np.argwhere(np.abs(picture - colour).max(axis=-1) < 60) for picture in (published, ours)]
+            if min(map(len, spots)) > 60:  # not cut by the edge
+                np.testing.assert_allclose(spots[1].mean(axis=0), spots[0].mean(axis=0), atol=0.6)
+                compared += 1
+    assert compared > FRAMES
 
 
 def test_evaluation_starts_where_the_list_says(listed: Path) -> None:

@@ -1,4 +1,4 @@
-"""Every layout is opened by its path alone, converted to the folder format and refused in one line when it is broken."""
+"""Every layout is opened by its path alone, converted to the folder format, and refused in one line when broken."""
 
 from __future__ import annotations
 
