@@ -6,6 +6,10 @@ The nearest of the drive's own folder and those above it is taken that holds eit
                                           local frame of that origin (`sequences.osm.local_projection`)
     *.osm.pbf, *.osm.gz, *.osm            one OpenStreetMap extract; drawn around the drive at 2 px/m, the resolution of
                                           the KITTI + OSM protocol, in the local frame of the drive's first fix
+
+and where none does, the satellite images of KITTI + aerial, one a record of the drive, as one photograph:
+
+    satmap/DATE/DRIVE/NNNNNNNNNN.png      beside raw_data/; see `sequences.satellite`
 """
 
 from __future__ import annotations
@@ -21,8 +25,10 @@ from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from learned.map_raster import MapRaster
+from sequences.aerial_mosaic import mosaic
 from sequences.map_source import MAP_FILE, read_json, read_map
 from sequences.osm import local_projection, rasterise, read_osm
+from sequences.satellite import read_satellite_image
 
 OSM_METRES_PER_PIXEL = 0.5
 OSM_MARGIN_M = 100.0
@@ -39,8 +45,10 @@ class GeoreferencedMap:
     origin_lat_lon: tuple[float, float]
 
 
-def find_map(folders: Iterable[Path], lat_lon: FloatArray) -> GeoreferencedMap:
+def find_map(folders: Iterable[Path], lat_lon: FloatArray, satellite_images: list[Path]) -> GeoreferencedMap:
     """The map of a drive through (N, 2) latitudes and longitudes, from the first of the folders that holds one.
+
+    Where none does it is made of the images, one a fix, if the first of them exists.
 
     Raises
     ------
@@ -58,7 +66,18 @@ def find_map(folders: Iterable[Path], lat_lon: FloatArray) -> GeoreferencedMap:
             raise SkyfixError(f"{folder}: expected one map extract, got {', '.join(file.name for file in extracts)}")
         if extracts:
             return _drawn(extracts[0], lat_lon)
-    raise SkyfixError(f"map: expected map/{MAP_FILE} or an OpenStreetMap extract in one of {', '.join(looked)}")
+    if satellite_images and satellite_images[0].exists():
+        origin, xy = _local(lat_lon)
+        return GeoreferencedMap(mosaic(xy, lambda index: read_satellite_image(satellite_images[index])), origin)
+    raise SkyfixError(
+        f"map: expected map/{MAP_FILE} or an OpenStreetMap extract in one of {', '.join(looked)}, or satmap/"
+    )
+
+
+def _local(lat_lon: FloatArray) -> tuple[tuple[float, float], FloatArray]:
+    """The first fix, and all of them (N, 2) in its local frame."""
+    origin = (float(lat_lon[0, 0]), float(lat_lon[0, 1]))
+    return origin, np.stack(local_projection(origin).transform(lat_lon[:, 1], lat_lon[:, 0]), axis=-1)
 
 
 def _folder_map(folder: Path) -> GeoreferencedMap:
@@ -70,8 +89,7 @@ def _folder_map(folder: Path) -> GeoreferencedMap:
 
 
 def _drawn(extract: Path, lat_lon: FloatArray) -> GeoreferencedMap:
-    origin = (float(lat_lon[0, 0]), float(lat_lon[0, 1]))
-    xy = np.stack(local_projection(origin).transform(lat_lon[:, 1], lat_lon[:, 0]), axis=-1)
+    origin, xy = _local(lat_lon)
     low = np.floor(xy.min(axis=0) - OSM_MARGIN_M)
     size = xy.max(axis=0) + OSM_MARGIN_M - low
     if not size.max() < _WIDEST_M:

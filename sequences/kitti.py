@@ -5,7 +5,7 @@
     DATE/DRIVE/velodyne_points/timestamps.txt        a date and time a scan
     DATE/DRIVE/velodyne_points/data/NNNNNNNNNN.bin   float32 (x, y, z, reflectance); numbers may be left out (some are)
     DATE/DRIVE/odometry/NAME.tum                     optional, not KITTI's: odometry of one's own, stamps in Unix time
-    a map beside DRIVE, DATE or above                see `sequences.drive_map`
+    a map beside DRIVE, DATE or above, or satmap/    see `sequences.drive_map`
 
 `skyfix track DATE/DRIVE` opens one. The body frame is the Velodyne's (x forward, y left, z up); the ground truth is the
 OXTS pose through the calibration, brought to the local metric frame of the map. Where there is no other, odometry is
@@ -59,7 +59,9 @@ class KittiDrive:
         imu_from_velo = read_imu_from_velo(drive.parent)
         oxts = read_oxts(drive / "oxts")
         self._scan_files, self.stamps_ns = _scans(drive / "velodyne_points")
-        found = find_map((drive, drive.parent, drive.parent.parent), oxts.values[:, :2])
+        root = drive.parent.parent.parent
+        images = [root / "satmap" / drive.parent.name / drive.name / f"{name}.png" for name in oxts.names]
+        found = find_map((drive, drive.parent, drive.parent.parent), oxts.values[:, :2], images)
         self.map: MapRaster = found.raster
         poses = planar(oxts.map_from_imu(found.origin_lat_lon) @ imu_from_velo)
         truth = Trajectory(oxts.stamps_ns, poses, None, "map")

@@ -27,7 +27,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from fusion import se2
 from fusion.arrays import FloatArray
@@ -39,9 +38,8 @@ from sequences.kitti import read_imu_from_velo
 from sequences.kitti_files import VELODYNE_GROUND_Z, numbers, planar, read_text
 from sequences.oxts import map_from_imu, read_record
 from sequences.point_file import read_points
+from sequences.satellite import METRES_PER_PIXEL, read_satellite_image
 
-METRES_PER_PIXEL = 156543.03392 * math.cos(math.radians(49.015)) / 2**18 / 2
-"""Web Mercator at the latitude that the protocol takes for all of KITTI: 0.1958 m."""
 CROP_PX = 512
 HALF_EXTENT_M = 20.0
 HALF_HEADING_DEG = 10.0
@@ -110,15 +108,7 @@ class KittiCrossview:
     def aerial(self, index: int) -> MapRaster:
         """The whole satellite image of frame `index`, north up, origin at the frame's GPS fix."""
         listed = self.frames[index]
-        path = self._root / "satmap" / listed.drive / f"{listed.frame}.png"
-        try:
-            with Image.open(path) as image:
-                picture = np.asarray(image.convert("RGB"))
-        except OSError as error:
-            raise SkyfixError(f"{path}: cannot be read: {error.strerror or 'not a readable image'}") from error
-        rows, cols = picture.shape[:2]
-        corner = -0.5 * METRES_PER_PIXEL * np.array([cols, rows])
-        return MapRaster(MapGrid(rows, cols, METRES_PER_PIXEL, float(corner[0]), float(corner[1])), None, picture)
+        return read_satellite_image(self._root / "satmap" / listed.drive / f"{listed.frame}.png")
 
     def _raw(self, listed: ListedFrame) -> Path:
         return self._root / "raw_data" / listed.drive

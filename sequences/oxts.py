@@ -40,15 +40,13 @@ class OxtsRecords:
         (N,) int64.
     values
         (N, 30), as in the files.
+    names
+        Of the files, without their ending.
     """
 
     stamps_ns: NDArray[np.int64]
     values: FloatArray
-
-    @property
-    def origin_lat_lon(self) -> tuple[float, float]:
-        """The first fix, degrees."""
-        return float(self.values[0, 0]), float(self.values[0, 1])
+    names: tuple[str, ...]
 
     def map_from_imu(self, origin_lat_lon: tuple[float, float]) -> FloatArray:
         """Poses (N, 4, 4) of the inertial unit (x forward, y left, z up) in the local frame about an origin."""
@@ -83,7 +81,9 @@ def read_oxts(folder: Path) -> OxtsRecords:
         raise SkyfixError(
             f"{folder / 'timestamps.txt'}: expected a line for each of {max(indices) + 1} records, got {len(stamps)}"
         )
-    return OxtsRecords(stamps[indices], np.concatenate([read_record(file) for file in files]))
+    return OxtsRecords(
+        stamps[indices], np.concatenate([read_record(file) for file in files]), tuple(file.stem for file in files)
+    )
 
 
 def read_record(file: Path) -> FloatArray:

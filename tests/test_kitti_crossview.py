@@ -14,7 +14,9 @@ from fusion import se2
 from fusion.errors import SkyfixError
 from sequences.evaluate import evaluate_frames
 from sequences.frame_set import covering_half_extent_m
-from sequences.kitti_crossview import METRES_PER_PIXEL, KittiCrossview, read_list
+from sequences.kitti import KittiDrive
+from sequences.kitti_crossview import KittiCrossview, read_list
+from sequences.satellite import METRES_PER_PIXEL
 from sequences.sequence import ScanError
 
 SIDE_PX = 900
@@ -109,6 +111,29 @@ def test_the_crop_is_the_published_one(listed: Path) -> None:
                 np.testing.assert_allclose(spots[1].mean(axis=0), spots[0].mean(axis=0), atol=0.6)
                 compared += 1
     assert compared > FRAMES
+
+
+def test_a_drive_has_all_its_images_as_one_map(listed: Path) -> None:
+    """Landmarks of every scan are where the mosaic shows them; it covers what all the images do."""
+    drive = KittiDrive(listed.parent / "raw_data" / DATE / DRIVE)
+    assert drive.map.classes is None
+    assert drive.ground_truth is not None
+    assert drive.map.grid.width_m == pytest.approx(60.0 + SIDE_PX * METRES_PER_PIXEL, abs=3.0)
+    for index, pose in enumerate(drive.ground_truth.poses):
+        on_map = se2.transform_points(pose, drive.scan(index)[:, :2].astype(np.float64))
+        rows, cols = np.floor(drive.map.grid.pixel_from_xy(on_map)).astype(int).T
+        np.testing.assert_array_equal(drive.map.picture[rows, cols], COLOURS)
+
+
+def test_images_that_are_missing_or_of_another_size(tmp_path: Path) -> None:
+    write_crossview(tmp_path)
+    drive, images = tmp_path / "raw_data" / DATE / DRIVE, tmp_path / "satmap" / DATE / DRIVE
+    Image.new("RGB", (300, 300)).save(images / "0000000011.png")
+    with pytest.raises(SkyfixError, match=r"satellite images: expected 900 x 900 px, got 300 x 300"):
+        KittiDrive(drive)
+    (images / "0000000011.png").unlink()
+    with pytest.raises(SkyfixError, match=r"0000000011\.png: cannot be read: No such file"):
+        KittiDrive(drive)
 
 
 def test_evaluation_starts_where_the_list_says(listed: Path) -> None:
