@@ -29,9 +29,9 @@ from sequences.cli_options import (
     MaxFramesOption,
     OutOption,
     OverwriteOption,
+    PickleOption,
     QuietOption,
     SeedOption,
-    open_sequence,
     training_line,
 )
 
@@ -73,7 +73,11 @@ def demo(
 )
 def track(
     sequence: Annotated[
-        Path, typer.Argument(help="Folder with map.json, odometry/*.tum, scans/ (see the README).", metavar="SEQUENCE")
+        Path,
+        typer.Argument(
+            help="Folder with map.json, odometry/*.tum, scans/, or a drive of KITTI or CARLA (see the README).",
+            metavar="SEQUENCE",
+        ),
     ],
     odometry: Annotated[
         str | None,
@@ -108,6 +112,7 @@ def track(
         float, typer.Option(help="How far off the map draws things, standard deviation, metres.", metavar="M")
     ] = 0.4,
     particles: Annotated[int, typer.Option(help="How many particles the filter has.", metavar="N")] = 10_000,
+    allow_pickle: PickleOption = False,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -115,10 +120,10 @@ def track(
 
     Writes a run directory (metrics.json, report.html, trajectories) and prints the errors, when there is ground truth.
     """
-    from sequences.folder import FolderSequence
+    from sequences.registry import OpenOptions, open_sequence
     from sequences.track_settings import TrackSettings
 
-    opened = FolderSequence(sequence, seed)
+    opened = open_sequence(sequence, OpenOptions(seed, allow_pickle))
     settings = TrackSettings(
         odometry=odometry or default_odometry(opened),
         seed=seed,
@@ -141,7 +146,9 @@ def track(
     "--half-heading-deg 10 --half-heading-deg 180 --markdown table.md`"
 )
 def evaluate(
-    sequences: Annotated[list[Path], typer.Argument(help="Sequence folders with ground truth.", metavar="SEQUENCE")],
+    sequences: Annotated[
+        list[Path], typer.Argument(help="Drives with ground truth, lists of frames.", metavar="SEQUENCE")
+    ],
     matcher: Annotated[
         list[str] | None,
         typer.Option(
@@ -153,27 +160,54 @@ def evaluate(
     heading_unknown: HeadingUnknownOption = False,
     max_frames: MaxFramesOption = 200,
     seed: SeedOption = 0,
+    allow_pickle: PickleOption = False,
     json_file: JsonOption = None,
     markdown_file: Annotated[
         Path | None,
         typer.Option("--markdown", help="Also write the table, with a legend, to this file.", metavar="FILE"),
     ] = None,
 ) -> None:
-    """Score single shots: each scan by itself from a start that is off, beside the prior's own score."""
+    """Score single shots: each scan by itself from a start that is off, beside the prior's own score.
+
+    Frames of a list (KITTI + aerial) start where the list says, whatever the options.
+    """
     from learned.matcher import load_matcher
-    from sequences.evaluate import evaluate_single_shot
+    from sequences.evaluate import evaluate_frames, evaluate_single_shot
     from sequences.evaluation_tables import markdown_page, markdown_table, matcher_labels
+    from sequences.frame_set import FrameSet
+    from sequences.registry import OpenOptions, open_any
     from sequences.shot_protocol import ShotProtocol
 
     headings = list(half_heading_deg or ([] if heading_unknown else [10.0])) + ([180.0] if heading_unknown else [])
     protocols = [ShotProtocol(half_extent, heading, max_frames, seed) for heading in dict.fromkeys(headings)]
     labels = matcher_labels(matcher or ["rotmatch", "geometric"])
     loaded = {label: load_matcher(name) for label, name in labels.items()}
-    opened = [open_sequence(path, seed) for path in sequences]
-    evaluations = [evaluate_single_shot(each, loaded, protocol) for each in opened for protocol in protocols]
+    evaluations = []
+    for path in sequences:
+        opened = open_any(path, OpenOptions(seed, allow_pickle))
+        if isinstance(opened, FrameSet):
+            evaluations.append(evaluate_frames(opened, loaded, max_frames))
+        else:
+            evaluations += [evaluate_single_shot(opened, loaded, protocol) for protocol in protocols]
     typer.echo(markdown_table(evaluations), nl=False)
     _write_json(json_file, evaluations)
     _write_text(markdown_file, markdown_page(evaluations, labels))
+
+
+@app.command(epilog="Example: `skyfix convert KITTI/raw_data/2011_09_26/2011_09_26_drive_0013_sync drives/kitti_13`")
+def convert(
+    source: Annotated[Path, typer.Argument(help="Any drive that track opens.", metavar="SRC")],
+    target: Annotated[Path, typer.Argument(help="New or empty folder to write.", metavar="DIR")],
+    seed: SeedOption = 0,
+    allow_pickle: PickleOption = False,
+) -> None:
+    """Write a drive in the folder format: map, scans, ground truth and every odometry."""
+    from sequences.folder import write_folder
+    from sequences.registry import OpenOptions, open_sequence
+
+    opened = open_sequence(source, OpenOptions(seed, allow_pickle))
+    write_folder(target, opened)
+    typer.echo(f"{target}: {len(opened.stamps_ns)} scans of {opened.name}")
 
 
 @app.command(
@@ -255,15 +289,13 @@ def export(
     from learned.export import export as write_export
     from learned.matcher import load_matcher
     from learned.rotmatch import RotMatch
-    from sequences.demo import DemoSequence
-    from sequences.folder import FolderSequence
     from sequences.matched_images import matched_images
+    from sequences.registry import OpenOptions, open_sequence
 
     matcher = load_matcher(checkpoint, "torch")
     images = []
     if int8 is not None and isinstance(matcher, RotMatch):
-        drive = DemoSequence(seed) if int8 == Path("demo") else FolderSequence(int8, seed)
-        images = matched_images(drive, matcher, frames)
+        images = matched_images(open_sequence(int8, OpenOptions(seed)), matcher, frames)
     typer.echo(f"export: {write_export(matcher, out, images)}")
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from fusion.errors import SkyfixError
-from sequences.cli_options import HalfExtentOption, HalfHeadingsOption, MaxFramesOption, open_sequence, training_line
+from sequences.cli_options import HalfExtentOption, HalfHeadingsOption, MaxFramesOption, training_line
 
 
 def ablate(
@@ -59,8 +59,9 @@ def ablate(
     """
     from sequences.ablate import AblateOptions
     from sequences.ablate import ablate as run_ablation
+    from sequences.registry import open_sequence
 
-    opened = [open_sequence(path, 0) for path in evaluate or []]
+    opened = [open_sequence(path) for path in evaluate or []]
     options = AblateOptions(
         _numbers(seeds), minutes, cache, tuple(override or ()), half_extent, tuple(half_heading_deg or ()), max_frames
     )

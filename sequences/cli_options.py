@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from sequences.sequence import Sequence
+    pass
 
 MatcherOption = Annotated[
     str,
@@ -51,15 +51,10 @@ HalfHeadingsOption = Annotated[
     ),
 ]
 MaxFramesOption = Annotated[int, typer.Option(help="Most scans of a sequence, spread evenly.", metavar="N")]
+PickleOption = Annotated[
+    bool, typer.Option("--allow-pickle", help="Unpickle scans (CARLA's), which runs code of whoever made the files.")
+]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")]
-
-
-def open_sequence(path: Path, seed: int) -> Sequence:
-    """The sequence in a folder; 'demo' is the embedded one."""
-    from sequences.demo import DemoSequence
-    from sequences.folder import FolderSequence
-
-    return DemoSequence(seed) if path == Path("demo") else FolderSequence(path, seed)
 
 
 def training_line(step: int, steps: int, loss: float, validation: float | None) -> None:

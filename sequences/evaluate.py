@@ -8,6 +8,7 @@ prior's heading looks like one that found it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +26,7 @@ from learned.matcher import MapMatcher, SearchRegion
 from learned.network import NetworkMatcher
 from learned.samples import Sample
 from sequences.drive import STAMP_TOLERANCE_NS
+from sequences.frame_set import FrameSet, covering_half_extent_m
 from sequences.sequence import ScanError, Sequence
 from sequences.shot_protocol import ShotProtocol
 from sequences.shot_scores import ShotScore, score_prior, score_shot, summarise_shots
@@ -76,7 +78,7 @@ def evaluate_single_shot(
                 points = sequence.scan(int(index))
             except ScanError:
                 continue
-            yield _Shot(pose, search, partial(_ask_matcher, points, sequence, search))
+            yield _Shot(pose, search, partial(_ask_matcher, points, sequence.ground_z, sequence.map, search))
 
     frames, methods = _scored(shots(), matchers)
     if frames == 0:
@@ -86,6 +88,52 @@ def evaluate_single_shot(
         "scans_simulated": sequence.scans_simulated,
         "skipped_frames": len(chosen) - frames,
         **protocol.stated(),
+        "methods": methods,
+    }
+
+
+def evaluate_frames(frames: FrameSet, matchers: Mapping[str, MapMatcher], max_frames: int = 200) -> dict[str, Any]:
+    """Score matchers on single frames, each from its listed start on its own map; as `evaluate_single_shot`.
+
+    The square that is searched holds the protocol's box, which lies on the axes of the vehicle.
+
+    Parameters
+    ----------
+    frames
+        With a map, a true pose and a start each.
+    matchers
+        By the name to list them under.
+    max_frames
+        At most so many, spread evenly. `seed` in what is returned is None: nothing is drawn.
+
+    Raises
+    ------
+    SkyfixError
+        If a frame's map or pose cannot be read, no scan can be used, or a matcher cannot use a map.
+    """
+    half_extent_m = covering_half_extent_m(frames.half_extent_m, frames.half_heading_deg)
+    chosen = _spread(np.arange(len(frames)), max_frames)
+
+    def shots() -> Iterable[_Shot]:
+        for index in chosen:
+            frame = frames.frame(int(index))
+            search = SearchRegion(frame.start, half_extent_m, math.radians(frames.half_heading_deg))
+            try:
+                points = frames.scan(int(index))
+            except ScanError:
+                continue
+            yield _Shot(frame.true_pose, search, partial(_ask_matcher, points, frames.ground_z, frame.map, search))
+
+    used, methods = _scored(shots(), matchers)
+    if used == 0:
+        raise SkyfixError(f"{frames.name}: expected a usable scan, got none in {len(chosen)}")
+    return {
+        "sequence": frames.name,
+        "scans_simulated": frames.scans_simulated,
+        "skipped_frames": len(chosen) - used,
+        "seed": None,
+        "max_frames": max_frames,
+        "start": {"half_extent_m": frames.half_extent_m, "half_heading_deg": frames.half_heading_deg},
         "methods": methods,
     }
 
@@ -123,9 +171,9 @@ def evaluate_samples(
 
 
 def _ask_matcher(
-    points: Float32Array, sequence: Sequence, search: SearchRegion, matcher: MapMatcher
+    points: Float32Array, ground_z: float, raster: MapRaster, search: SearchRegion, matcher: MapMatcher
 ) -> LikelihoodVolume:
-    return matcher.match(points, sequence.ground_z, sequence.map, search)
+    return matcher.match(points, ground_z, raster, search)
 
 
 def _ask_network(
@@ -170,6 +218,11 @@ def _frames(sequence: Sequence, truth: Trajectory, max_frames: int) -> np.ndarra
     covered = np.flatnonzero((stamps >= first - STAMP_TOLERANCE_NS) & (stamps <= last + STAMP_TOLERANCE_NS))
     if len(covered) == 0:
         raise SkyfixError(f"{sequence.name}: expected ground truth that overlaps the scans in time, got none")
-    if len(covered) <= max_frames:
-        return covered
-    return covered[np.linspace(0, len(covered) - 1, max_frames).round().astype(int)]
+    return _spread(covered, max_frames)
+
+
+def _spread(indices: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the indices, evenly."""
+    if len(indices) <= most:
+        return indices
+    return indices[np.linspace(0, len(indices) - 1, most).round().astype(int)]

@@ -25,12 +25,12 @@ from fusion.trajectory import Trajectory
 from learned.map_raster import MapRaster
 from sequences.lidar import LidarModel, simulate_scan
 from sequences.map_source import read_json, read_map, read_number, write_map
-from sequences.sequence import SCAN_COLUMNS, ScanError, Sequence, checked_points
+from sequences.odometry_files import OdometryFiles
+from sequences.point_file import read_points
+from sequences.sequence import ScanError, Sequence
 from sequences.trajectory_io import format_seconds, read_times, read_tum, write_tum
 from sequences.world_model import World
 from sequences.world_raster import world_from_raster
-
-_BYTES_PER_POINT = SCAN_COLUMNS * 4
 
 
 class FolderSequence:
@@ -59,7 +59,8 @@ class FolderSequence:
         self.map: MapRaster = read_map(self._path)
         truth_file = self._path / "ground_truth.tum"
         self.ground_truth: Trajectory | None = read_tum(truth_file) if truth_file.exists() else None
-        self.odometry_names: tuple[str, ...] = tuple(sorted(file.stem for file in self._path.glob("odometry/*.tum")))
+        self._odometry = OdometryFiles(self._path, self.name)
+        self.odometry_names: tuple[str, ...] = self._odometry.names
         self._lidar = LidarModel()
         self._has_scans = (self._path / "scans").is_dir()
         if self._has_scans:
@@ -82,25 +83,11 @@ class FolderSequence:
         """
         if not self._has_scans:
             return self._simulated_scan(index)
-        path = self._scan_file(index)
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise ScanError(f"scan {path.name}: cannot be read: {error.strerror}") from error
-        if len(content) % _BYTES_PER_POINT:
-            raise ScanError(
-                f"scan {path.name}: expected a multiple of {_BYTES_PER_POINT} bytes (float32 x, y, z, reflectance), "
-                f"got {len(content)}"
-            )
-        points = np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(-1, SCAN_COLUMNS)
-        return checked_points(points, f"scan {path.name}")
+        return read_points(self._scan_file(index))
 
     def odometry(self, name: str) -> Trajectory:
         """Read the named odometry; `SkyfixError` listing the names there are when it is unknown."""
-        if name not in self.odometry_names:
-            there_are = ", ".join(self.odometry_names) or "none"
-            raise SkyfixError(f"odometry {name!r}: unknown for {self.name}; there are: {there_are}")
-        return read_tum(self._path / "odometry" / f"{name}.tum", frame_id=name)
+        return self._odometry.read(name)
 
     def _scan_file(self, index: int) -> Path:
         return self._path / "scans" / f"{index:06d}.bin"

@@ -1,7 +1,7 @@
 """What a drive is to the rest of skyfix: a map, stamped scans, odometry and, for evaluation, ground truth.
 
-Readers (`folder`, `demo`) implement the protocol; everything that runs over a drive (`localize`, `evaluate`) takes it
-and no more.
+Readers (`folder`, `demo`, `kitti`, `kitti_odometry`, `carla`; `registry` finds the one for a path) implement the
+protocol; everything that runs over a drive (`localize`, `evaluate`) takes it and no more.
 """
 
 from __future__ import annotations
