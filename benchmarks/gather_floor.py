@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion import LikelihoodVolume, se2
 from fusion.arrays import FloatArray
-from fusion.kernels_math import KERNEL, F, take
+from fusion.kernels.float_math import KERNEL, F, take
 
 
 @numba.njit(**KERNEL)

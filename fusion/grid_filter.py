@@ -1,8 +1,8 @@
 """The grid filter: the exact Bayes filter on cells of (heading, y, x), no particles and no Gaussians.
 
 It is the reference that other filters are tested against, and a filter in its own right where the map is small or the
-start unknown: it cannot lose a hypothesis. Prediction is `fusion.grid_motion`, which keeps mean and covariance exact.
-The measurement is evaluated at the centres of the cells, so likelihoods narrower than a cell need a finer grid.
+start unknown: it cannot lose a hypothesis. Prediction is `fusion.grids.grid_motion`, which keeps mean and covariance
+exact. The measurement is evaluated at the centres of the cells, so likelihoods narrower than a cell need a finer grid.
 
 Mass that leaves the map is not lost and never wraps around: it becomes the probability of being outside, whose
 measurements are worth the density of the likelihood far away, and which `lost_score` reports. Mean, covariance and
@@ -27,16 +27,16 @@ from fusion.arrays import Float32Array, FloatArray, checked, read_only
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.grid import MapGrid
-from fusion.grid_kernels import reweigh
-from fusion.grid_lookup import look_up
-from fusion.grid_moments import grid_modes, grid_moments
-from fusion.grid_motion import GridMotion
+from fusion.grids.grid_kernels import reweigh
+from fusion.grids.grid_lookup import look_up
+from fusion.grids.grid_moments import grid_modes, grid_moments
+from fusion.grids.grid_motion import GridMotion
+from fusion.grids.pose_lattice import PoseLattice
+from fusion.grids.scratch import Scratch
 from fusion.likelihood import PoseLikelihood
 from fusion.odometry import OdometryIncrement
 from fusion.pose_filter import UpdateReport
-from fusion.pose_lattice import PoseLattice
 from fusion.prior import UniformPrior
-from fusion.scratch import Scratch
 
 _WHOLE = 2.0**100
 _LEAST = 1e-30

@@ -20,15 +20,15 @@ import numpy as np
 from fusion.arrays import Float32Array, FloatArray, read_only
 from fusion.errors import SkyfixError
 from fusion.grid_filter import GridFilter
-from fusion.grid_kernels import reweigh
-from fusion.grid_lookup import look_up
-from fusion.grid_moments import grid_moments
-from fusion.grid_motion import GridMotion
-from fusion.grid_paths import draw_cells, draw_sources
+from fusion.grids.grid_kernels import reweigh
+from fusion.grids.grid_lookup import look_up
+from fusion.grids.grid_moments import grid_moments
+from fusion.grids.grid_motion import GridMotion
+from fusion.grids.grid_paths import draw_cells, draw_sources
+from fusion.grids.pose_lattice import PoseLattice
+from fusion.grids.scratch import Scratch
 from fusion.likelihood import PoseLikelihood
 from fusion.odometry import OdometryIncrement
-from fusion.pose_lattice import PoseLattice
-from fusion.scratch import Scratch
 from fusion.trajectory import Trajectory
 
 _WHOLE = 2.0**100

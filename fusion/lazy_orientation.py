@@ -21,7 +21,7 @@ from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.likelihood import DEFAULT_FLOOR, OutlierMixture
 from fusion.location_orientation import LocationOrientationMaps
-from fusion.lookup import MOST_CELLS, Lookup
+from fusion.particles.lookup import MOST_CELLS, Lookup
 
 
 @dataclass(frozen=True, slots=True, eq=False)

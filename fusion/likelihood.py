@@ -17,9 +17,9 @@ from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.interpolation import corners
-from fusion.kernels_likelihood import survey, tempered_mass
-from fusion.lookup import MOST_CELLS, Lookup
+from fusion.kernels.likelihood_mass import survey, tempered_mass
 from fusion.modes import circular_run, find_modes
+from fusion.particles.lookup import MOST_CELLS, Lookup
 
 DEFAULT_FLOOR = -40.0
 

@@ -15,9 +15,9 @@ from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
 from fusion.interpolation import corners
-from fusion.kernels_likelihood import log_mass_of_maps
+from fusion.kernels.likelihood_mass import log_mass_of_maps
 from fusion.likelihood import DEFAULT_FLOOR, LikelihoodVolume, OutlierMixture, checked_temperature
-from fusion.lookup import MOST_CELLS, Lookup
+from fusion.particles.lookup import MOST_CELLS, Lookup
 
 
 @dataclass(frozen=True, slots=True, eq=False)

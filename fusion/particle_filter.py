@@ -1,11 +1,11 @@
 """The particle filter: online fusion of odometry increments with map likelihoods.
 
 Sequential importance resampling on SE(2) with log weights, kernel regularisation and a model of being lost, see
-`fusion.lost`. When the log odds of being lost exceed a margin, particles drawn from the likelihood are injected with
-the total weight `lost_score`: exactly the posterior of the mixture of both states.
+`fusion.particles.lost`. When the log odds of being lost exceed a margin, particles drawn from the likelihood are
+injected with the total weight `lost_score`: exactly the posterior of the mixture of both states.
 
-A step is one pass over the particles, see `fusion.cloud`: `predict` writes an increment down, and the `update` that
-follows moves, weighs and sums. Estimates are of the weighted cloud, before resampling adds its noise.
+A step is one pass over the particles, see `fusion.particles.cloud`: `predict` writes an increment down, and the
+`update` that follows moves, weighs and sums. Estimates are of the weighted cloud, before resampling adds its noise.
 
 Sources: Gordon, Salmond, Smith 1993; Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, 8.3.5 (augmented MCL).
 """
@@ -18,23 +18,23 @@ from numpy.typing import ArrayLike
 
 from fusion import se2
 from fusion.arrays import FloatArray, checked, read_only
-from fusion.cloud import Cloud, Moments, positive_definite
-from fusion.clusters import find_clusters
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
-from fusion.filter_state import ParticleFilterState, generator_of, generator_state
 from fusion.grid import MapGrid
-from fusion.guided_proposal import guided
-from fusion.lattice_density import LatticeDensity
 from fusion.likelihood import OutlierMixture, PoseLikelihood, checked_temperature
-from fusion.lookup import lookup_of
-from fusion.lost import LostModel, log_uniform_evidence, probability
-from fusion.map_start import stratified_poses
 from fusion.odometry import OdometryIncrement
-from fusion.particle_filter_settings import ParticleFilterSettings
+from fusion.particles.cloud import Cloud, Moments, positive_definite
+from fusion.particles.clusters import find_clusters
+from fusion.particles.filter_state import ParticleFilterState, generator_of, generator_state
+from fusion.particles.guided_proposal import guided
+from fusion.particles.lattice_density import LatticeDensity
+from fusion.particles.lookup import lookup_of
+from fusion.particles.lost import LostModel, log_uniform_evidence, probability
+from fusion.particles.map_start import stratified_poses
+from fusion.particles.particle_filter_settings import ParticleFilterSettings
+from fusion.particles.regularisation import is_compact, regularised, silverman_bandwidth
 from fusion.pose_filter import UpdateReport
 from fusion.prior import UniformPrior
-from fusion.regularisation import is_compact, regularised, silverman_bandwidth
 from fusion.resampling import RESAMPLERS
 
 __all__ = ["ParticleFilter", "ParticleFilterSettings", "ParticleFilterState"]
@@ -102,7 +102,7 @@ class ParticleFilter:
         settings: ParticleFilterSettings | None = None,
         allowed: ArrayLike | None = None,
     ) -> Self:
-        """A filter that knows nothing: `count` particles all over a map, stratified, see `fusion.map_start`."""
+        """A filter that knows nothing: `count` particles all over a map, see `fusion.particles.map_start`."""
         rng = np.random.default_rng(seed)
         return cls(stratified_poses(grid, count, rng, allowed), rng, settings)
 

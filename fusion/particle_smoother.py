@@ -20,12 +20,12 @@ import numpy as np
 
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray, read_only
-from fusion.backward_kernel import step_back
-from fusion.cloud_history import CloudHistory
-from fusion.clusters import VARIANCE_FLOOR
 from fusion.errors import SkyfixError
+from fusion.kernels.backward import step_back
 from fusion.odometry import accumulate
-from fusion.odometry_bridge import bridge
+from fusion.particles.cloud_history import CloudHistory
+from fusion.particles.clusters import VARIANCE_FLOOR
+from fusion.particles.odometry_bridge import bridge
 from fusion.trajectory import Trajectory
 
 

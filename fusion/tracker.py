@@ -6,9 +6,10 @@
     tracker.estimate().pose
 
 It has no thread, no clock and no queue of its own accord: everything happens in the caller's calls. What comes late,
-but within the history, counts as if it had come in time, bit for bit (`fusion.timeline`); what comes later still is
-counted and dropped. Bad input raises and changes nothing. Odometry that cannot be true is not believed
-(`fusion.odometry_limits`, `fusion.clock_guard`). A tracker can be saved and goes on from the file bit for bit.
+but within the history, counts as if it had come in time, bit for bit (`fusion.tracking.timeline`); what comes later
+still is counted and dropped. Bad input raises and changes nothing. Odometry that cannot be true is not believed
+(`fusion.tracking.odometry_limits`, `fusion.tracking.clock_guard`). A tracker can be saved and goes on from the file bit
+for bit.
 """
 
 from collections import Counter
@@ -19,20 +20,20 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fusion.archive import Tree, read_archive, write_archive
-from fusion.clock_guard import ClockGuard, Side
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.likelihood import PoseLikelihood
-from fusion.likelihood_tree import is_same_likelihood
 from fusion.odometry import OdometryIncrement
-from fusion.odometry_buffer import OdometrySample
-from fusion.odometry_limits import MotionKind
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.prior import UniformPrior
-from fusion.resumable import ResumableFilter
-from fusion.timeline import Progress, Timeline
-from fusion.tracker_input import (
+from fusion.tracking.archive import Tree, read_archive, write_archive
+from fusion.tracking.clock_guard import ClockGuard, Side
+from fusion.tracking.likelihood_tree import is_same_likelihood
+from fusion.tracking.odometry_buffer import OdometrySample
+from fusion.tracking.odometry_limits import MotionKind
+from fusion.tracking.resumable import ResumableFilter
+from fusion.tracking.timeline import Progress, Timeline
+from fusion.tracking.tracker_input import (
     check_likelihood,
     checked_increment,
     checked_pose,
@@ -40,8 +41,8 @@ from fusion.tracker_input import (
     checked_whole,
     one_line,
 )
-from fusion.tracker_report import Arrival, Outcome, Statistics
-from fusion.tracker_settings import TrackerSettings, settings_from_tree
+from fusion.tracking.tracker_report import Arrival, Outcome, Statistics
+from fusion.tracking.tracker_settings import TrackerSettings, settings_from_tree
 
 _FORMAT, _VERSION = "skyfix tracker", 1
 

@@ -1,7 +1,7 @@
 """A drive with real odometry and EMULATED measurements: what a tracker makes of a network with published errors.
 
 Odometry and ground truth are a sequence's own; in place of scans, a map and a network, likelihoods with a stated error
-profile are drawn about the ground truth (`fusion.likelihood_emulator`). So the rows say how well odometry and
+profile are drawn about the ground truth (`fusion.emulation.likelihood_emulator`). So the rows say how well odometry and
 measurements of that quality are fused, and nothing about a network, a map, or the truth's own accuracy.
 
 Fairness: the start is drawn from the profile's box about the truth and is all that the filter knows of it; odometry,
@@ -17,16 +17,16 @@ import numpy as np
 
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
-from fusion.cloud_history import CloudHistory
 from fusion.consistency import MAX_TEMPERATURE, correlated_error_temperature
-from fusion.error_profile import TRANSLOCNET_KITTI, ErrorProfile
+from fusion.emulation.error_profile import TRANSLOCNET_KITTI, ErrorProfile
+from fusion.emulation.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
-from fusion.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
 from fusion.odometry import OdometryNoise, increments_at
 from fusion.odometry_calibration import OdometryCalibration
 from fusion.particle_filter import ParticleFilter
 from fusion.particle_smoother import ParticleSmootherSettings, sample_paths
+from fusion.particles.cloud_history import CloudHistory
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 from sequences.metrics import summarise

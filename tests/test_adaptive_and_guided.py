@@ -17,10 +17,10 @@ from fusion import (
     SkyfixError,
     se2,
 )
-from fusion.guided_proposal import guided
-from fusion.lattice_density import LatticeDensity
-from fusion.lost import LostModel, log_uniform_evidence, probability
-from fusion.map_start import stratified_poses
+from fusion.particles.guided_proposal import guided
+from fusion.particles.lattice_density import LatticeDensity
+from fusion.particles.lost import LostModel, log_uniform_evidence, probability
+from fusion.particles.map_start import stratified_poses
 
 GRID = MapGrid(40, 60, 0.5, -15.0, -10.0)
 MEASURED = np.diag([0.6, 0.4, 0.03]) ** 2

@@ -17,7 +17,7 @@ from fusion import (
     SkyfixError,
     se2,
 )
-from fusion.emulated_likelihood import cut_normal_quantile
+from fusion.emulation.emulated_likelihood import cut_normal_quantile
 from fusion.likelihood import log_uniform_density
 
 PROFILES = (TRANSLOCNET_KITTI, FG2_KITTI_SAME_AREA, ORIENTERNET_KITTI_SEQUENTIAL)

@@ -23,10 +23,10 @@ from fusion import (
     UniformPrior,
     se2,
 )
-from fusion.grid_kernels import selling
-from fusion.grid_lookup import look_up
-from fusion.grid_motion import GridMotion, symmetric_taps
-from fusion.scratch import Scratch
+from fusion.grids.grid_kernels import selling
+from fusion.grids.grid_lookup import look_up
+from fusion.grids.grid_motion import GridMotion, symmetric_taps
+from fusion.grids.scratch import Scratch
 
 GRID = MapGrid(41, 61, 0.5, -15.0, -10.0)
 PLAIN = GridFilterSettings(outlier_probability=1e-9, kidnap_probability=0.0)

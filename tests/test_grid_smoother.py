@@ -19,9 +19,9 @@ from fusion import (
     se2,
     smooth_on_grid,
 )
-from fusion.grid_motion import GridMotion
-from fusion.pose_lattice import PoseLattice
-from fusion.scratch import Scratch
+from fusion.grids.grid_motion import GridMotion
+from fusion.grids.pose_lattice import PoseLattice
+from fusion.grids.scratch import Scratch
 
 TINY = MapGrid(3, 4, 1.0, -2.0, -1.5)
 HEADINGS = 3

@@ -13,10 +13,10 @@ from fusion import (
     ParticleFilterSettings,
     se2,
 )
-from fusion.cloud import Cloud, lower_root
-from fusion.kernels_likelihood import survey, tempered_mass
-from fusion.kernels_math import KERNEL, exp, log, sine_cosine
-from fusion.kernels_random import U, normal_pair, threefry
+from fusion.kernels.float_math import KERNEL, exp, log, sine_cosine
+from fusion.kernels.likelihood_mass import survey, tempered_mass
+from fusion.kernels.random import U, normal_pair, threefry
+from fusion.particles.cloud import Cloud, lower_root
 
 KEY = np.array([1, 2, 3, 4], np.uint32)
 GRID = MapGrid(23, 17, 0.5, -4.0, 3.0)

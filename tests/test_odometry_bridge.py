@@ -3,7 +3,7 @@
 import numpy as np
 
 from fusion import OdometryIncrement, accumulate, se2
-from fusion.odometry_bridge import bridge
+from fusion.particles.odometry_bridge import bridge
 
 
 def increment(stamp, delta, covariance):

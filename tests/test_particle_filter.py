@@ -14,9 +14,9 @@ from fusion import (
     UniformPrior,
     se2,
 )
-from fusion.clusters import find_clusters
 from fusion.consistency import nees
-from fusion.regularisation import matrix_root, regularised
+from fusion.particles.clusters import find_clusters
+from fusion.particles.regularisation import matrix_root, regularised
 
 GRID = MapGrid(81, 81, 0.5, -20.25, -20.25)
 MEASURED = np.diag([0.6, 0.4, 0.03]) ** 2

@@ -18,7 +18,7 @@ from fusion import (
     sample_paths,
     se2,
 )
-from fusion.backward_kernel import step_back
+from fusion.kernels.backward import step_back
 
 GRID = MapGrid(400, 400, 0.5, -100.0, -100.0)
 MEASURED = np.diag([0.6, 0.4, 0.03]) ** 2

@@ -26,8 +26,8 @@ from fusion import (
     TrackerSettings,
     UniformPrior,
 )
-from fusion.archive import read_archive, write_archive
-from fusion.likelihood_tree import is_same_likelihood, likelihood_from_tree, likelihood_tree
+from fusion.tracking.archive import read_archive, write_archive
+from fusion.tracking.likelihood_tree import is_same_likelihood, likelihood_from_tree, likelihood_tree
 
 SETTINGS = TrackerSettings(
     history_s=1.0,

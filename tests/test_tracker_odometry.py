@@ -37,7 +37,7 @@ from fusion import (
     increments_at,
     se2,
 )
-from fusion.odometry_buffer import BEGINNING, OdometryBuffer, OdometrySample
+from fusion.tracking.odometry_buffer import BEGINNING, OdometryBuffer, OdometrySample
 
 PRIOR = UniformPrior(np.zeros(3), 3.0, 0.2)
 NOISE, LIMITS = OdometryNoise(), OdometryLimits()

@@ -12,8 +12,8 @@ of the newest in the run and none from inside the window among them, says that t
 from enum import Enum
 from typing import Any, Self
 
-from fusion.archive import Tree
-from fusion.odometry_buffer import OdometrySample, sample_tree
+from fusion.tracking.archive import Tree
+from fusion.tracking.odometry_buffer import OdometrySample, sample_tree
 
 
 class Side(Enum):

@@ -8,7 +8,7 @@ from fusion.arrays import FloatArray, checked, read_only
 from fusion.errors import SkyfixError
 from fusion.likelihood import PoseLikelihood
 from fusion.odometry import OdometryIncrement
-from fusion.odometry_buffer import OdometrySample
+from fusion.tracking.odometry_buffer import OdometrySample
 
 _LARGEST = 1e8  # metres and radians: beyond it float64 knows less than a micrometre
 

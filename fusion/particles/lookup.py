@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray, read_only
 from fusion.grid import MapGrid
-from fusion.kernels_step import LOOKUP_SIZE, MAPS, VOLUME
+from fusion.kernels.step import LOOKUP_SIZE, MAPS, VOLUME
 
 MOST_CELLS = 2**31 - 1
 """Cells are counted in 32 bits."""

@@ -8,8 +8,8 @@ was there; their product is the chance of having come that way.
 import numpy as np
 
 from fusion.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from fusion.grid_kernels import DIRECTIONS
-from fusion.grid_motion import GridMotion
+from fusion.grids.grid_kernels import DIRECTIONS
+from fusion.grids.grid_motion import GridMotion
 
 _BLOCK = 2**20  # ways looked at together
 

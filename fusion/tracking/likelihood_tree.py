@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from fusion.archive import Tree
 from fusion.errors import SkyfixError
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
+from fusion.tracking.archive import Tree
 
 _FIELDS: dict[type, tuple[str, ...]] = {
     GaussianLikelihood: ("mean", "covariance", "floor"),

@@ -11,8 +11,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels_math import KERNEL, F, exp
-from fusion.kernels_step import BLOCK, LARGEST
+from fusion.kernels.float_math import KERNEL, F, exp
+from fusion.kernels.step import BLOCK, LARGEST
 
 _LANES = 4  # running sums that do not wait for each other
 

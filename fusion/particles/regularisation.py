@@ -15,8 +15,8 @@ from typing import TypeVar
 import numpy as np
 
 from fusion.arrays import FloatArray
-from fusion.clusters import CELL_M, CELL_RAD, find_clusters
-from fusion.kernels_clusters import spread_in_clusters
+from fusion.kernels.clusters import spread_in_clusters
+from fusion.particles.clusters import CELL_M, CELL_RAD, find_clusters
 
 FloatOrArray = TypeVar("FloatOrArray", float, FloatArray)
 
@@ -33,7 +33,7 @@ def silverman_bandwidth(count: FloatOrArray, dimensions: int) -> FloatOrArray:
 
 
 def is_compact(covariance: list[list[float]]) -> bool:
-    """Whether a cloud is narrow enough to be one cluster: its spread less than a cell of `fusion.clusters`."""
+    """Whether a cloud is narrow enough to be one cluster: spread less than a cell of `fusion.particles.clusters`."""
     return max(covariance[0][0], covariance[1][1]) < CELL_M**2 and covariance[2][2] < CELL_RAD**2
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray
 from fusion.gaussian_mixture import GaussianMixture
-from fusion.grid_kernels import mix_headings, plane_moments
+from fusion.grids.grid_kernels import mix_headings, plane_moments
+from fusion.grids.pose_lattice import PoseLattice
 from fusion.likelihood import LikelihoodVolume
 from fusion.modes import find_modes
-from fusion.pose_lattice import PoseLattice
 
 _INSIDE_A_CELL = 1.0 / 12.0
 _FRAME = 2

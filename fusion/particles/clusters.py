@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
 from fusion.gaussian_mixture import GaussianMixture
-from fusion.kernels_clusters import cells_of, components, moments_of
+from fusion.kernels.clusters import cells_of, components, moments_of
 
 CELL_M = 2.0
 _YAW_CELLS = 24  # 15 degrees each

@@ -15,8 +15,8 @@ import numpy as np
 
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
-from fusion.clusters import find_clusters
-from fusion.regularisation import silverman_bandwidth
+from fusion.particles.clusters import find_clusters
+from fusion.particles.regularisation import silverman_bandwidth
 from fusion.resampling import effective_sample_size, systematic
 
 _CORNERS = tuple(product((0, 1), repeat=3))

@@ -13,9 +13,9 @@ import numpy as np
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray, IntArray
 from fusion.errors import SkyfixError
+from fusion.grids.pose_lattice import PoseLattice
+from fusion.grids.scratch import Scratch
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood, log_uniform_density
-from fusion.pose_lattice import PoseLattice
-from fusion.scratch import Scratch
 
 _BLOCK = 64
 _FAR_M = 1e7

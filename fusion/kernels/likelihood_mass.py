@@ -4,7 +4,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels_math import KERNEL, F, bits_of, exp, larger
+from fusion.kernels.float_math import KERNEL, F, bits_of, exp, larger
 
 _RUN = 4096
 _NOT_FINITE = np.int32(0x7F800000)

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.arrays import Float32Array, FloatArray
-from fusion.clusters import VARIANCE_FLOOR
-from fusion.kernels_resample import block_masses, share_out, spread_blocks
-from fusion.kernels_step import (
+from fusion.kernels.resample import block_masses, share_out, spread_blocks
+from fusion.kernels.step import (
     BLOCK,
     CENTRE,
     DELTA,
@@ -37,7 +36,8 @@ from fusion.kernels_step import (
     combined,
     step_blocks,
 )
-from fusion.lookup import NO_SLOTS, NO_TABLE, Lookup
+from fusion.particles.clusters import VARIANCE_FLOOR
+from fusion.particles.lookup import NO_SLOTS, NO_TABLE, Lookup
 
 _REACH_M = 64.0  # the anchor follows the cloud when its mean is farther away
 _NOBODY = np.zeros(0, np.int32)

@@ -17,7 +17,7 @@ import numpy as np
 from fusion import se2
 from fusion.arrays import FloatArray, checked
 from fusion.odometry import OdometryIncrement
-from fusion.regularisation import matrix_root
+from fusion.particles.regularisation import matrix_root
 
 _CORRECTIONS = 3
 _LEAST_VARIANCE = np.diag([1e-10, 1e-10, 1e-12])  # keeps S invertible when an odometry claims to be perfect

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels_math import (
+from fusion.kernels.float_math import (
     INLINED,
     KERNEL,
     F,
@@ -28,7 +28,7 @@ from fusion.kernels_math import (
     take,
     wrap,
 )
-from fusion.kernels_random import U, normal_pair, threefry
+from fusion.kernels.random import U, normal_pair, threefry
 
 BLOCK = 1024
 SCRATCH_SIZE = 11 * BLOCK
@@ -100,7 +100,7 @@ def _fetch(source: Float32s, ancestors: NDArray[np.int32], start: int, n: int, s
 
 @numba.njit(**KERNEL)
 def _regularise(n: int, motion: Float64s, s: Float32s) -> None:
-    """Draw a block towards the mean and add kernel noise, see `fusion.regularisation`."""
+    """Draw a block towards the mean and add kernel noise, see `fusion.particles.regularisation`."""
     mx, my, mt, shrink = F(motion[14]), F(motion[15]), F(motion[16]), F(motion[17])
     r00, r10, r11 = F(motion[18]), F(motion[21]), F(motion[22])
     r20, r21, r22 = F(motion[24]), F(motion[25]), F(motion[26])
@@ -318,7 +318,7 @@ def step_blocks(
     source, ancestors
         (3 M,) x, y, yaw before the step, and (N,) whom to copy; without ancestors M is N and everyone stays.
     motion
-        (MOTION_SIZE,) as `fusion.cloud` packs it; empty when nobody moves, and then `cloud` is read, not written.
+        (MOTION_SIZE,) as `fusion.particles.cloud` packs it; empty when nobody moves: then `cloud` is read, not written.
     key, epoch
         Of the random numbers.
     cloud
@@ -326,7 +326,7 @@ def step_blocks(
     mode
         NOTHING, VOLUME or MAPS: how to weigh.
     table, location, slots, shape, look
-        As `fusion.lookup` packs them.
+        As `fusion.particles.lookup` packs them.
     log_weights
         (N,) before the step; empty for equal ones, which then count as 0.
     out

@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from fusion.archive import Tree
 from fusion.consistency import correlated_error_temperature
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
-from fusion.history import History, Node, history_from_tree
 from fusion.likelihood import PoseLikelihood
-from fusion.likelihood_buffer import LikelihoodBuffer
 from fusion.odometry import OdometryIncrement, accumulate
-from fusion.odometry_buffer import BEGINNING, OdometryBuffer, OdometrySample
-from fusion.resumable import ResumableFilter
-from fusion.tracker_report import Measured
-from fusion.tracker_settings import TrackerSettings
+from fusion.tracking.archive import Tree
+from fusion.tracking.history import History, Node, history_from_tree
+from fusion.tracking.likelihood_buffer import LikelihoodBuffer
+from fusion.tracking.odometry_buffer import BEGINNING, OdometryBuffer, OdometrySample
+from fusion.tracking.resumable import ResumableFilter
+from fusion.tracking.tracker_report import Measured
+from fusion.tracking.tracker_settings import TrackerSettings
 
 _NODE_STREAM, _FORWARD_STREAM = 0, 1
 

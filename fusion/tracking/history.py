@@ -4,7 +4,7 @@ from bisect import bisect_right
 from dataclasses import dataclass
 from typing import Any
 
-from fusion.archive import Tree
+from fusion.tracking.archive import Tree
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,8 +17,8 @@ from scipy.special import betaincinv, ndtr
 
 from fusion import se2
 from fusion.arrays import FloatArray, checked
-from fusion.emulated_likelihood import EmulatedLikelihood, cut_normal_quantile
-from fusion.error_profile import ErrorProfile
+from fusion.emulation.emulated_likelihood import EmulatedLikelihood, cut_normal_quantile
+from fusion.emulation.error_profile import ErrorProfile
 from fusion.errors import SkyfixError
 
 _FALSE_MODE_SIGMAS = 4.0  # where the weaker mode is cut off

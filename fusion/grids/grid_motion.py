@@ -5,7 +5,7 @@ is the same for all cells, so the operator is two steps.
 
 1. Every plane moves by its rotated `delta` and is blurred by its rotated ``S = Q_pp - Q_pt Q_tp / Q_tt``, the spread of
    the position when the error of the heading is known. Whole cells are moved, the rest becomes the plane's offset. The
-   blur with the full 2 x 2 covariance is three blurs along lines of cells (`fusion.grid_kernels`).
+   blur with the full 2 x 2 covariance is three blurs along lines of cells (`fusion.grids.grid_kernels`).
 2. Heading errors move shares of the mass to other planes; a share whose heading erred by e goes along with the position
    by its conditional mean ``Q_pt / Q_tt e``, which is how a heading error during the motion carries it sideways.
    The turn itself moves nothing: it turns the lattice.
@@ -31,10 +31,10 @@ import numpy as np
 
 from fusion.arrays import Float32Array, FloatArray, IntArray
 from fusion.errors import SkyfixError
-from fusion.grid_kernels import DIRECTIONS, mass_mixed_away, mix_headings, selling, translate
+from fusion.grids.grid_kernels import DIRECTIONS, mass_mixed_away, mix_headings, selling, translate
+from fusion.grids.pose_lattice import PoseLattice
+from fusion.grids.scratch import Scratch
 from fusion.odometry import OdometryIncrement
-from fusion.pose_lattice import PoseLattice
-from fusion.scratch import Scratch
 
 _THREE_TAPS = 1.0 / 3.0  # variance in cells squared up to which three taps are enough
 _RADIUS_SIGMAS = 5.0

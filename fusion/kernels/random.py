@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numba import types
 
-from fusion.kernels_math import INLINED, F, bits_of, float_of, half_circle, intrinsic, log
+from fusion.kernels.float_math import INLINED, F, bits_of, float_of, half_circle, intrinsic, log
 
 U = np.uint32
 _PARITY = U(0x1BD11BDA)

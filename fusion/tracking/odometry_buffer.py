@@ -8,10 +8,10 @@ from typing import Any, Self
 import numpy as np
 
 from fusion import se2
-from fusion.archive import Tree
 from fusion.arrays import FloatArray
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate
-from fusion.odometry_limits import MotionKind, OdometryLimits, part_of
+from fusion.tracking.archive import Tree
+from fusion.tracking.odometry_limits import MotionKind, OdometryLimits, part_of
 
 BEGINNING = -(2**63)
 """Before every stamp."""

@@ -16,8 +16,8 @@ Source: Thrun, Fox, Burgard, Dellaert, "Robust Monte Carlo localization for mobi
 import numpy as np
 
 from fusion.arrays import FloatArray
-from fusion.lattice_density import LatticeDensity
 from fusion.likelihood import PoseLikelihood
+from fusion.particles.lattice_density import LatticeDensity
 
 
 def guided(

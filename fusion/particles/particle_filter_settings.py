@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from math import isfinite
 
 from fusion.errors import SkyfixError
-from fusion.kld_sampling import KldSampling
-from fusion.lost import LostModel
+from fusion.particles.kld_sampling import KldSampling
+from fusion.particles.lost import LostModel
 from fusion.resampling import RESAMPLERS
 
 
@@ -33,7 +33,8 @@ class ParticleFilterSettings:
         Share of the particles that is injected then, in [0, 1); 0 switches recovery off.
     guided_share : float
         Share of the particles drawn from each measurement instead of the prediction, in [0, 1); see
-        `fusion.guided_proposal`. For measurements much sharper than the prediction; costs far more than a plain step.
+        `fusion.particles.guided_proposal`. For measurements much sharper than the prediction; costs far more than a
+        plain step.
     adaptive : KldSampling or None
         Choose the number of particles anew at every measurement, which then always resamples.
     standstill_m, standstill_rad : float

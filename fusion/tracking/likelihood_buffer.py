@@ -3,9 +3,9 @@
 from bisect import bisect_left, bisect_right, insort
 from typing import Any, Self
 
-from fusion.archive import Tree
 from fusion.likelihood import PoseLikelihood
-from fusion.likelihood_tree import likelihood_from_tree, likelihood_tree
+from fusion.tracking.archive import Tree
+from fusion.tracking.likelihood_tree import likelihood_from_tree, likelihood_tree
 
 
 class LikelihoodBuffer:

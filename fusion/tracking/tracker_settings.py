@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from fusion.archive import Tree
 from fusion.errors import SkyfixError
 from fusion.odometry import OdometryNoise
-from fusion.odometry_limits import OdometryLimits
+from fusion.tracking.archive import Tree
+from fusion.tracking.odometry_limits import OdometryLimits
 
 
 @dataclass(frozen=True, slots=True)

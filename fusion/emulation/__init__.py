@@ -1,0 +1,1 @@
+"""Likelihoods with a stated error profile in a network's place; everything made with them says 'emulated'."""

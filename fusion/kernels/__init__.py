@@ -1,0 +1,1 @@
+"""Compiled loops of the particle filter and smoother: numba, counter-based randomness, no state."""

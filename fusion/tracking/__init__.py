@@ -1,0 +1,1 @@
+"""The parts of the online tracker: buffers, history, checks of what arrives."""
