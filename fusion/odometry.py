@@ -80,7 +80,7 @@ class OdometryNoise:
     """
 
     longitudinal_m_per_sqrt_m: float = 0.1
-    lateral_m_per_sqrt_m: float = 0.03
+    lateral_m_per_sqrt_m: float = 0.06
     heading_rad_per_sqrt_m: float = 0.002
     heading_rad_per_sqrt_rad: float = 0.06
     position_m_per_sqrt_s: float = 0.02
