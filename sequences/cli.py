@@ -325,16 +325,23 @@ def benchmark(
     runs: Annotated[int, typer.Option(help="Timed runs of each implementation.", metavar="N")] = 15,
     json_file: JsonOption = None,
 ) -> None:
-    """Time skyfix beside peers (filterpy, scipy) that do the same work on the same made-up input, on this machine.
+    """Time skyfix beside peers (numpy, torch, filterpy, scipy) that do the same work on the same made-up input.
 
     The last column is the time in units of skyfix's own: above 1, skyfix is the quicker.
-    `make benchmark` holds it all to one thread.
+    `make benchmark` holds it all to one thread. With --json, plots of the filter's step are written beside FILE.
     """
     from benchmarks import markdown_table, run_benchmarks, thread_statement
+    from benchmarks.filter_packages import missing_packages
+    from benchmarks.plots import write_plots
 
+    for package in missing_packages():
+        print(f"not measured: {package} is not installed (pip install 'skyfix[benchmark]')", file=sys.stderr)
     rows = run_benchmarks(name, runs, lambda line: print(line, file=sys.stderr))
     typer.echo(f"{thread_statement()}\n\n{markdown_table(rows)}", nl=False)
     _write_json(json_file, rows)
+    if json_file is not None:
+        for plot in write_plots(rows, json_file):
+            typer.echo(f"plot: {plot}")
 
 
 @app.callback(invoke_without_command=True)
