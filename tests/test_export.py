@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from landmark_scenes import BEV, Scene, matched, scene
+from made_drive import MadeDrive
 
 from fusion.errors import SkyfixError
 from learned.backends import BACKENDS, Backend, first_installed
@@ -20,6 +23,9 @@ from learned.geometric import GeometricMatcher
 from learned.matcher import SearchRegion, load_matcher
 from learned.rotmatch import RotMatch, RotMatchNet, RotMatchSettings
 from learned.voting_net import VotingMatcher
+from sequences.cli import main
+from sequences.folder import FolderSequence
+from sequences.matched_images import matched_images
 
 FP32 = [name for name, backend in BACKENDS.items() if backend.weights == "fp32"]
 INT8 = [name for name, backend in BACKENDS.items() if backend.weights == "int8"]
@@ -207,3 +213,30 @@ def test_what_cannot_be_run_is_named(folder: Path, tmp_path: Path, monkeypatch: 
 def test_the_first_installed_backend_computes_in_32_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("learned.backends.find_spec", lambda package: package == "onnxruntime" or None)
     assert first_installed().name == "onnxruntime"
+
+
+def test_command_writes_a_folder_that_can_be_loaded(
+    made_drive: MadeDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    RotMatch(RotMatchNet(SMALL), Calibration(1.7, 9.0)).save(tmp_path / "net.safetensors", {})
+    out = tmp_path / "out"
+    arguments = ["skyfix", "export", str(tmp_path / "net.safetensors"), "--out", str(out)]
+    rounding = all(find_spec(package) for package in ("onnx", "onnxruntime"))
+    monkeypatch.setattr(sys, "argv", [*arguments, *(["--int8", str(made_drive.path), "--frames", "2"] * rounding)])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 0
+    assert capsys.readouterr().out == f"export: {out / 'export.json'}\n"
+    assert (out / "map.int8.onnx").exists() == rounding
+    assert json.loads((out / "export.json").read_text())["calibration"]["temperature"] == 1.7
+
+
+def test_images_are_of_as_many_scans_as_asked_for(made_drive: MadeDrive) -> None:
+    drive, matcher = FolderSequence(made_drive.path, 0), RotMatch(RotMatchNet(SMALL))
+    images = matched_images(drive, matcher, 3)
+    assert len(images) == 3
+    for density, picture in images:
+        assert density.shape == (4, BEV.size, BEV.size)
+        assert picture.shape == (3, 144, 144)
+    with pytest.raises(SkyfixError, match="frames: expected >= 1, got 0"):
+        matched_images(drive, matcher, 0)
