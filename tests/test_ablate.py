@@ -43,7 +43,7 @@ training:
 """
 ABLATION = """
 base: base.yaml
-evaluation_samples: 3
+evaluation_samples: 2
 variants:
   full: {}
   "other, twice": {training.network.scan_worth: false, training.learning_rate: 1.0e-05}
@@ -133,7 +133,7 @@ def _check_tables(content: dict[str, Any], out: Path, page: Path) -> None:
         assert table["start"]["half_heading_deg"] == half_heading_deg
         assert table["sequence"] == SIMULATED
         assert table["scans_simulated"]
-        assert table["prior"]["frames"] == 3
+        assert table["prior"]["frames"] == 2
         assert table["prior"]["likelihood"]["nll"] == pytest.approx(
             box_nll(20.0, np.radians(half_heading_deg)), abs=1e-6
         )
@@ -218,7 +218,8 @@ def test_bad_options_are_named(config: Path, tmp_path: Path) -> None:
 
 
 def test_values_survive_the_way_through_overrides(config: Path) -> None:
-    changes = {"training.learning_rate": 1e-5, "training.network": {"architecture": "rotmatch", "channels": 6}}
+    network = {"architecture": "rotmatch", "channels": 6, "bev": {"half_extent_m": 24.0}}
+    changes = {"training.learning_rate": 1e-5, "training.network": network}
     config.write_text(yaml.safe_dump({"base": "base.yaml", "variants": {"a": {**changes, "training.ema_decay": None}}}))
     (variant,) = read_ablation(config).variants
     assert variant.config.training.learning_rate == 1e-5
