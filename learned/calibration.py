@@ -68,7 +68,11 @@ class Calibration:
 
     def confidence(self, likelihood: PoseLikelihood) -> float:
         """The chance that the best mode of a calibrated likelihood is right: within `RIGHT_WITHIN_M` of the truth."""
-        return float(probability(peak_mass(likelihood), self.confidence_slope, self.confidence_intercept)[0])
+        return self.chance(peak_mass(likelihood))
+
+    def chance(self, mass: float) -> float:
+        """The same from the mass of the best mode."""
+        return float(probability(mass, self.confidence_slope, self.confidence_intercept)[0])
 
 
 class CountsMatcher(Protocol):

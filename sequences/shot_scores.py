@@ -21,7 +21,6 @@ from fusion.errors import SkyfixError
 from fusion.likelihood import LikelihoodVolume
 from fusion.particle_filter import ParticleFilterSettings
 from learned.calibration import RIGHT_WITHIN_M, Calibration
-from learned.confidence import peak_mass
 from learned.matcher import SearchRegion
 from learned.reliability import expected_calibration_error, highest_density_level, region_coverage
 from sequences.measurement import best_pose
@@ -64,14 +63,16 @@ def score_shot(likelihood: LikelihoodVolume, truth: FloatArray, calibration: Cal
     The stated chance is the mass of the best mode, mapped by the calibration where there is one.
     """
     pose = onto_evaluated(likelihood, truth)
-    mode = likelihood.modes(1).means[0, :2]
+    best = likelihood.modes(1)
+    mass = float(best.weights[0])
+    away = best.means[0, :2] - truth[:2]
     return ShotScore(
         best_pose(likelihood),
         -float(likelihood.log_density(pose[None])[0]),
         -float(likelihood.with_outliers(OUTLIER_PROBABILITY).log_density(pose[None])[0]),
         highest_density_level(likelihood, pose),
-        peak_mass(likelihood) if calibration is None else calibration.confidence(likelihood),
-        bool(np.hypot(*(mode - truth[:2])) < RIGHT_WITHIN_M),
+        mass if calibration is None else calibration.chance(mass),
+        bool(np.hypot(*away) < RIGHT_WITHIN_M),
     )
 
 

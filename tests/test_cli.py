@@ -318,5 +318,5 @@ def test_help_explains_every_option_and_gives_an_example(
 def test_help_lists_the_commands(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     shown = skyfix(capsys, monkeypatch, "--help")
     assert shown.code == 0
-    for command in ("demo", "track", "evaluate", "train", "view", "benchmark"):
+    for command in ("demo", "track", "evaluate", "train", "ablate", "view", "benchmark"):
         assert re.search(rf"\b{command}\b", shown.out)
