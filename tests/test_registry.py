@@ -88,7 +88,9 @@ def test_track_opens_any_drive(
         opened.append(sequence)
         raise SkyfixError("that will do")
 
-    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(np.zeros((FRAMES, 3))))
+    monkeypatch.setattr(
+        learned.matcher, "load_matcher", lambda name, backend=None: EmulatedMatcher(np.zeros((FRAMES, 3)))
+    )
     monkeypatch.setattr(sequences.localize, "track", stop)
     arguments = ["track", str(WRITERS[layout](tmp_path)), "--out", str(tmp_path / "run"), "--allow-pickle", "--quiet"]
     assert skyfix(capsys, monkeypatch, *arguments) == (2, "skyfix: error: that will do\n")
@@ -106,7 +108,7 @@ def test_evaluate_opens_everything(
     else:
         assert opened.ground_truth is not None
         truth = opened.ground_truth.interpolate(opened.stamps_ns)
-    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(truth))
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name, backend=None: EmulatedMatcher(truth))
     arguments = ["evaluate", str(path), "--matcher", "x", "--json", str(tmp_path / "x.json"), "--allow-pickle"]
     assert skyfix(capsys, monkeypatch, *arguments) == (0, "")
     (result,) = json.loads((tmp_path / "x.json").read_text())
@@ -268,7 +270,9 @@ def test_what_is_broken_is_refused_in_one_line(
     layout, spoil, message = SPOILS[case]
     path = WRITERS[layout](tmp_path)
     spoil(path.parent if path.is_file() else path)
-    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(np.zeros((FRAMES, 3))))
+    monkeypatch.setattr(
+        learned.matcher, "load_matcher", lambda name, backend=None: EmulatedMatcher(np.zeros((FRAMES, 3)))
+    )
     command = "evaluate" if layout == "kitti_crossview" else "track"
     code, errors = skyfix(capsys, monkeypatch, command, str(path), "--allow-pickle")
     assert code == 2
