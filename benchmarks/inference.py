@@ -44,11 +44,13 @@ def example_images(net: RotMatchNet, position_half_m: float) -> tuple[Tensor, Te
 
 def networks(net: RotMatchNet, density: Tensor, picture: Tensor) -> dict[str, Net]:
     """The network in torch and in every backend that is installed, by the name to list it under."""
+    found: dict[str, Net] = {"skyfix RotMatch, torch": net}
+    if find_spec("onnx") is None:
+        return found
     graphs = {"fp32": encoder_graphs(net)}
     if all(find_spec(package) for package in ("onnx", "onnxruntime")):
         images = {"scan": density.numpy(), "map": picture.numpy()}
         graphs["int8"] = {name: quantised(graph, [images[name]]) for name, graph in graphs["fp32"].items()}
-    found: dict[str, Net] = {"skyfix RotMatch, torch": net}
     for backend in BACKENDS.values():
         if backend.installed and backend.weights in graphs:
             found[f"skyfix RotMatch, {backend.name}"] = _exported(net, graphs[backend.weights], backend)

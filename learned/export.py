@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -53,7 +54,14 @@ def encoder_graphs(net: RotMatchNet) -> dict[str, bytes]:
     """The two encoders as ONNX, {"scan": (B, bands, n, n) -> features, "map": (B, 3, H, W) -> features}.
 
     Sides are multiples of `CROP_MULTIPLE`, as in torch.
+
+    Raises
+    ------
+    SkyfixError
+        If the package onnx is missing.
     """
+    if find_spec("onnx") is None:
+        raise SkyfixError("export: expected the package onnx, got none installed: pip install 'skyfix[onnxruntime]'")
     side = 4 * CROP_MULTIPLE
     with torch.inference_mode(False), torch.no_grad():
         scan = _graph(_Encoder(net, net.scan_features), torch.rand(1, len(BANDS_M), side, side))

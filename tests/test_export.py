@@ -27,6 +27,8 @@ from sequences.cli import main
 from sequences.folder import FolderSequence
 from sequences.matched_images import matched_images
 
+pytestmark = pytest.mark.skipif(find_spec("onnx") is None, reason="needs the package onnx: skyfix[onnxruntime]")
+
 FP32 = [name for name, backend in BACKENDS.items() if backend.weights == "fp32"]
 INT8 = [name for name, backend in BACKENDS.items() if backend.weights == "int8"]
 SMALL = RotMatchSettings(4, (4, 4, 8, 8), BEV)

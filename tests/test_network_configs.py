@@ -21,7 +21,7 @@ def test_every_baseline_has_one() -> None:
 @pytest.mark.parametrize("name", ["aglnet", "hybrid", "orienternet"])
 def test_a_configuration_is_of_its_network_and_on_the_samples_of_rotmatch(name: str) -> None:
     path = FOLDER / "configs" / f"{name}.yaml"
-    config, shipped = read_config(path), read_config(FOLDER / "weights" / "rotmatch.yaml")
+    config, shipped = read_config(path), read_config(FOLDER / "weights" / "rotmatch_near.yaml")
     network = config.training.network
     assert network.name == name
     assert network.settings == ARCHITECTURES[name].settings_type()  # what is recommended is the default
@@ -47,7 +47,7 @@ def test_the_configurations_of_translocnet_are_of_the_paper_and_on_the_samples_o
 ) -> None:
     config, shipped = (
         read_config(FOLDER / "configs" / f"{name}.yaml"),
-        read_config(FOLDER / "weights" / "rotmatch.yaml"),
+        read_config(FOLDER / "weights" / "rotmatch_near.yaml"),
     )
     network, augmentation = config.training.network, config.training.augmentation
     assert network.name == architecture

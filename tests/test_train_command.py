@@ -138,10 +138,13 @@ def test_overrides_are_typed_and_checked(tiny: Path) -> None:
 
 
 def test_the_shipped_weights_configuration_is_still_one() -> None:
-    path = Path(sequences.__file__).parents[1] / "learned" / "weights" / "rotmatch.yaml"
-    config = read_config(path)
-    assert config.training.network == NetworkChoice("rotmatch")
-    assert config.matching_reach_m == 72.0
+    """Both stages: scans to 40 m, then to the reach of matching, from the first one's weights."""
+    weights = Path(sequences.__file__).parents[1] / "learned" / "weights"
+    near, far = read_config(weights / "rotmatch_near.yaml"), read_config(weights / "rotmatch.yaml")
+    assert near.training.network == NetworkChoice("rotmatch")
+    assert (near.matching_reach_m, near.initial_share) == (72.0, 0.0)
+    assert far.training.network.settings.bev.half_extent_m == far.matching_reach_m == 72.0
+    assert far.initial_share == 0.5
 
 
 def test_a_cache_is_shared_by_runs_of_one_simulation_alone(tmp_path: Path) -> None:
