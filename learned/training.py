@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Protocol
 
 import numpy as np
@@ -131,12 +132,10 @@ def train(
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that can be written to, or raise SkyfixError."""
-    probe = path / ".writable"
+    """Make a folder that can be written to, or raise SkyfixError; several processes may do so at once."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
+        TemporaryFile(dir=path).close()
     except OSError as error:
         raise SkyfixError(f"training: expected a folder to write to at {path}: {error.strerror}") from error
 
