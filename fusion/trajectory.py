@@ -78,34 +78,6 @@ class Trajectory:
         """First and last stamp."""
         return int(self.stamp_ns[0]), int(self.stamp_ns[-1])
 
-    def overlap_ns(self, other: "Trajectory") -> tuple[int, int]:
-        """First and last stamp that both trajectories cover.
-
-        Raises
-        ------
-        SkyfixError
-            When they have no time in common.
-        """
-        start = max(self.span_ns[0], other.span_ns[0])
-        end = min(self.span_ns[1], other.span_ns[1])
-        if start > end:
-            raise SkyfixError(
-                f"trajectories: expected an overlap in time, got {self.span_ns} ns and {other.span_ns} ns"
-            )
-        return start, end
-
-    def between_stamps(self, start_ns: int, end_ns: int) -> "Trajectory":
-        """The poses with ``start_ns <= stamp <= end_ns``.
-
-        Raises
-        ------
-        SkyfixError
-            When there are none.
-        """
-        keep = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
-        covariances = None if self.covariances is None else self.covariances[keep]
-        return Trajectory(self.stamp_ns[keep], self.poses[keep], covariances, self.frame_id)
-
     def interpolate(self, stamps_ns: ArrayLike, tolerance_ns: int = 0) -> FloatArray:
         """Poses (M, 3) at `stamps_ns` (M,), moving at a constant body twist between neighbouring poses.
 

@@ -266,12 +266,13 @@ def test_choice_weighs_evidence_against_the_null_hypothesis():
 def test_bad_input_is_refused():
     stamps, increments, measurements, prior, truth, _ = drive(5, 10)
     initial = rough(stamps, truth)
+    short = Trajectory(initial.stamp_ns[:2], initial.poses[:2])
     shifted = [OdometryIncrement(one.stamp_ns + 1, one.delta, one.covariance) for one in increments]
     for word, call in {
         "4 increments": lambda: smooth(stamps, increments[:-1], measurements, prior, initial),
         "5 measurements": lambda: smooth(stamps, increments, measurements[:-1], prior, initial),
         "other stamps": lambda: smooth(stamps, shifted, measurements, prior, initial),
-        "expected stamps in": lambda: smooth(stamps, increments, measurements, prior, initial.between_stamps(0, 1)),
+        "expected stamps in": lambda: smooth(stamps, increments, measurements, prior, short),
         "int64": lambda: smooth(stamps * 1e-9, increments, measurements, prior, initial),
         "outlier_probability": lambda: SmootherSettings(outlier_probability=1.0),
         "clutter": lambda: SmootherSettings(clutter_log_density=-np.inf),

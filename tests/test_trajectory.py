@@ -56,14 +56,9 @@ def test_a_single_pose_answers_at_its_own_stamp():
     assert trajectory.length_m == 0.0
 
 
-def test_length_overlap_and_cutting():
+def test_length_is_that_of_the_path():
     straight = Trajectory(np.arange(5) * 10, np.array([[3.0 * i, 4.0 * i, 0.0] for i in range(5)]))
     assert straight.length_m == pytest.approx(20.0)
-    later = Trajectory(np.arange(5) * 10 + 25, straight.poses)
-    assert straight.overlap_ns(later) == (25, 40)
-    assert list(straight.between_stamps(10, 25).stamp_ns) == [10, 20]
-    with pytest.raises(SkyfixError, match="overlap"):
-        straight.overlap_ns(Trajectory(np.array([100]), np.zeros((1, 3))))
 
 
 @pytest.mark.parametrize(
