@@ -122,7 +122,7 @@ def calibrate_odometry(
 
     def cost(calibration: OdometryCalibration) -> float:
         increments = increments_at(stamps, calibration.corrected(odometry), noise)
-        return smooth(stamps, increments, measurements, prior, initial, settings).cost + before.cost(calibration)
+        return smooth(stamps, increments, measurements, prior, initial, settings).log_evidence * -1.0 + before.cost(calibration)
 
     found = np.zeros(4)
     for _ in range(_SWEEPS):

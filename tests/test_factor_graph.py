@@ -17,7 +17,9 @@ from fusion import (
     smooth,
 )
 from fusion.consistency import coverage, nees
-from fusion.hypotheses import NOT_MEASURED, REJECTED, Hypotheses
+from fusion.graph.measurements import NOT_MEASURED, REJECTED
+from fusion.graph.mixture_bank import MixtureBank
+from fusion.graph.sites import Sites
 
 STEP_NS = 100_000_000
 MEASURED = np.diag([0.5, 0.3, 0.02]) ** 2
@@ -235,32 +237,28 @@ def test_fifteen_hundred_nodes_take_seconds():
 
 def test_cavities_take_out_exactly_one_measurement():
     """Marginal = cavity x measurement: for Gaussians the product is undone to rounding."""
-    rng = np.random.default_rng(9)
     cavity_mean, cavity = np.array([1.0, 2.0, 3.0]), np.diag([4.0, 1.0, 0.01])
     measured_mean, measured = cavity_mean + np.array([0.5, -0.3, 0.4]), MEASURED
     information = np.linalg.inv(cavity) + np.linalg.inv(measured)
     marginal = np.linalg.inv(information)
     step = marginal @ np.linalg.solve(measured, measured_mean - cavity_mean)
-    hypotheses = Hypotheses.of(
-        [None, single(se2.wrap(measured_mean) * [0, 0, 1] + measured_mean * [1, 1, 0], measured)]
-    )
-    poses = np.array([rng.normal(size=3), cavity_mean + step])
-    covariances = np.array([np.eye(3), marginal])
-    means, spreads = hypotheses.cavities(poses, covariances, np.array([NOT_MEASURED, 0]))
-    np.testing.assert_allclose(means, [poses[0], cavity_mean], atol=1e-9)
-    np.testing.assert_allclose(spreads, [np.eye(3), cavity], atol=1e-9)
-    untouched, _ = hypotheses.cavities(poses, covariances, np.array([NOT_MEASURED, REJECTED]))
-    np.testing.assert_array_equal(untouched, poses)
+    sites = Sites(se2.wrap(measured_mean)[None], np.linalg.inv(measured)[None], np.zeros((1, 3)))
+    means, spreads = sites.cavities((cavity_mean + step)[None], marginal[None])
+    np.testing.assert_allclose(means[0], cavity_mean, atol=1e-9)
+    np.testing.assert_allclose(spreads[0], cavity, atol=1e-9)
 
 
 def test_choice_weighs_evidence_against_the_null_hypothesis():
     modes = GaussianMixture(np.array([0.7, 0.3]), np.array([[5.0, 0, 0], [0.2, 0, 0]]), np.array([MEASURED] * 2))
-    hypotheses = Hypotheses.of([modes, None])
-    poses, tight, wide = np.zeros((2, 3)), np.array([MEASURED] * 2), np.array([np.diag([25.0, 25.0, 0.01])] * 2)
-    assert list(hypotheses.choose(poses, tight, 0.05, -9.2)) == [1, NOT_MEASURED]
-    assert list(hypotheses.choose(poses, wide, 0.05, -9.2)) == [0, NOT_MEASURED]  # undecided by place: the heavier
-    assert list(hypotheses.choose(poses + np.array([0, 9.0, 0]), tight, 0.05, -9.2)) == [REJECTED, NOT_MEASURED]
-    assert list(hypotheses.choose(poses, tight, 0.999999, 5.0)) == [REJECTED, NOT_MEASURED]
+    pose, tight, wide = np.zeros((1, 3)), MEASURED[None], np.diag([25.0, 25.0, 0.01])[None]
+
+    def best(centre, spread, outlier_probability=0.05, clutter=-9.2):
+        return MixtureBank([modes], outlier_probability, clutter).windowed(centre, spread)[1][0]
+
+    assert best(pose, tight) == 1
+    assert best(pose, wide) == 0  # undecided by place: the heavier
+    assert best(pose + np.array([0, 9.0, 0]), tight) == REJECTED
+    assert best(pose, tight, 0.999999, 5.0) == REJECTED
 
 
 def test_bad_input_is_refused():

@@ -1,0 +1,75 @@
+"""Measurements: what was seen along a drive, whole likelihoods and Gaussian mixtures alike."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fusion.arrays import FloatArray, IntArray
+from fusion.gaussian_likelihood import GaussianLikelihood
+from fusion.gaussian_mixture import GaussianMixture
+from fusion.graph.likelihood_bank import LikelihoodBank
+from fusion.graph.mixture_bank import MixtureBank
+from fusion.graph.patch import LikelihoodPatch, patch_of
+from fusion.graph.windowed import Windowed
+from fusion.likelihood import PoseLikelihood
+
+Measurement = GaussianMixture | LikelihoodPatch | PoseLikelihood
+"""Tempered for errors correlated in time, without outliers."""
+
+REJECTED = -1
+NOT_MEASURED = -2
+
+
+class Measurements:
+    """The measurements of a graph's nodes; M nodes have one.
+
+    Parameters
+    ----------
+    measurements : sequence of N Measurement or None
+        One a node.
+    outlier_probability : float
+        Chance that a measurement says nothing, in [0, 1).
+    clutter_log_density : float
+        ln density of such a measurement per m^2 rad where it does not tell itself (mixtures).
+    """
+
+    def __init__(
+        self, measurements: Sequence[Measurement | None], outlier_probability: float, clutter_log_density: float
+    ) -> None:
+        mixtures, patches = {}, {}
+        for node, measurement in enumerate(measurements):
+            if isinstance(measurement, GaussianLikelihood):
+                measurement = measurement.modes(1)
+            if isinstance(measurement, GaussianMixture):
+                mixtures[node] = measurement
+            elif measurement is not None:
+                is_patch = isinstance(measurement, LikelihoodPatch)
+                patches[node] = measurement if is_patch else patch_of(measurement)
+        self.nodes: IntArray = np.array([*mixtures, *patches], dtype=np.int64)
+        self._count, self._outlier = len(measurements), outlier_probability
+        self._mixtures = MixtureBank(list(mixtures.values()), outlier_probability, clutter_log_density)
+        self._bank = LikelihoodBank(list(patches.values()), outlier_probability)
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def are_gaussian(self) -> bool:
+        """Whether each is a single Gaussian that is certainly right: a linear problem but for the headings."""
+        return self._outlier == 0.0 and len(self._bank) == 0 and self._mixtures.width == 1
+
+    def windowed(self, centres: FloatArray, covariances: FloatArray) -> tuple[Windowed, IntArray]:
+        """Moments under windows (M, 3) and (M, 3, 3); and for each node (N,) the component that explains it best.
+
+        That is 0 for a whole likelihood, REJECTED where an outlier explains better, NOT_MEASURED elsewhere.
+        """
+        split = len(self._mixtures)
+        mixed, best = self._mixtures.windowed(centres[:split], covariances[:split])
+        whole = self._bank.windowed(centres[split:], covariances[split:])
+        chosen = np.full(self._count, NOT_MEASURED, dtype=np.int64)
+        chosen[self.nodes[:split]] = best
+        chosen[self.nodes[split:]] = np.where(self._bank.outlier_share(whole.log_mass) > 0.5, REJECTED, 0)
+        if split == 0 or split == len(self):
+            return (whole if split == 0 else mixed), chosen
+        names = ("roots", "log_mass", "means", "spreads", "flat")
+        return Windowed(*(np.concatenate([getattr(mixed, name), getattr(whole, name)]) for name in names)), chosen

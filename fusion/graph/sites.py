@@ -1,0 +1,84 @@
+"""Sites: the Gaussian factors that stand for the measurements at the present estimate, and what is left without them.
+
+Source: Minka, "Expectation propagation for approximate Bayesian inference", UAI 2001.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusion import se2
+from fusion.arrays import FloatArray
+
+_LEAST_SHARE = 1e-3  # of a marginal's information that stays when its own factor is taken out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sites:
+    """Factors ``exp(-1/2 d^T L d + h^T d)`` of deviations ``d = x - reference`` on the axes of the map, M in all.
+
+    Parameters
+    ----------
+    reference : (M, 3) float64
+        Poses.
+    precision : (M, 3, 3) float64
+        L, positive semidefinite.
+    information : (M, 3) float64
+        h.
+    """
+
+    reference: FloatArray
+    precision: FloatArray
+    information: FloatArray
+
+    def about(self, poses: FloatArray) -> "Sites":
+        """The same factors with other references (M, 3)."""
+        moved = deviations(self.reference, poses)
+        return Sites(poses, self.precision, self.information + np.einsum("mij,mj->mi", self.precision, moved))
+
+    def mixed(self, other: "Sites", share: float) -> "Sites":
+        """The geometric mean with others, which get a share in [0, 1]; about the others' references."""
+        mine = self.about(other.reference)
+        precision = (1.0 - share) * mine.precision + share * other.precision
+        return Sites(other.reference, precision, (1.0 - share) * mine.information + share * other.information)
+
+    def costs(self, poses: FloatArray) -> FloatArray:
+        """Minus the factors' logarithms (M,) at poses (M, 3)."""
+        off = deviations(poses, self.reference)
+        quadratic = 0.5 * np.einsum("mi,mij,mj->m", off, self.precision, off)
+        return np.asarray(quadratic - np.einsum("mi,mi->m", self.information, off))
+
+    def cavities(self, poses: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Marginals (M, 3), (M, 3, 3) with the own factor of each divided out."""
+        own = self.about(poses)
+        roots = np.linalg.cholesky(covariances)
+        across = roots.swapaxes(1, 2)
+        whitened = np.eye(3) - across @ own.precision @ roots
+        values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.swapaxes(1, 2)))
+        inverse = (vectors / np.maximum(values, _LEAST_SHARE)[:, None, :]) @ vectors.swapaxes(1, 2)
+        cavity = roots @ inverse @ across
+        centres = poses - np.einsum("mij,mj->mi", cavity, own.information)
+        centres[:, 2] = se2.wrap(centres[:, 2])
+        return centres, 0.5 * (cavity + cavity.swapaxes(1, 2))
+
+    def log_integrals(self, centres: FloatArray, covariances: FloatArray) -> FloatArray:
+        """ln of the factors' means (M,) over ``N(centres, covariances)``."""
+        own = self.about(centres)
+        roots = np.linalg.cholesky(covariances)
+        across = roots.swapaxes(1, 2)
+        total = np.eye(3) + across @ own.precision @ roots
+        information = np.einsum("mij,mj->mi", across, own.information)
+        gained = np.einsum("mi,mi->m", information, np.linalg.solve(total, information[..., None])[..., 0])
+        return np.asarray(0.5 * (gained - np.linalg.slogdet(total)[1])) - self.costs(centres)
+
+
+def deviations(poses: FloatArray, reference: FloatArray) -> FloatArray:
+    """``poses - reference`` (..., 3), yaw the short way."""
+    off = poses - reference
+    off[..., 2] = se2.wrap(off[..., 2])
+    return off
+
+
+def no_sites(reference: FloatArray) -> Sites:
+    """Factors of measurements that say nothing, at poses (M, 3)."""
+    return Sites(reference, np.zeros((len(reference), 3, 3)), np.zeros((len(reference), 3)))
