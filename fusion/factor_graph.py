@@ -3,71 +3,36 @@
 Between neighbouring nodes stands an odometry factor; on a measured node the Gaussian that has the likelihood's effect
 there, found anew in every round (see `fusion.graph.propagation`). Mixtures of a few modes can be had in place of whole
 likelihoods. Covariances are those of the probability mass, not of the curvature at a peak.
+
+The rounds see the measured nodes only, with the motions between them composed; all others are solved for at the end.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
-import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion.arrays import FloatArray, IntArray
 from fusion.errors import SkyfixError
-from fusion.graph.covariances import noises_of, positive_definite
-from fusion.graph.measurements import Measurement, Measurements
-from fusion.graph.pose_graph import PoseGraph
-from fusion.graph.propagation import propagate
+from fusion.graph.assembly import pose_graph
+from fusion.graph.chain import Chain
+from fusion.graph.covariances import positive_definite
+from fusion.graph.measurements import NOT_MEASURED, REJECTED, Measurement, Measurements
+from fusion.graph.odometry_drift import OdometryDrift
+from fusion.graph.pose_graph import PoseGraph, Solution
+from fusion.graph.propagation import Propagated, propagate
+from fusion.graph.sites import Sites
+from fusion.graph.smoother_settings import SmootherSettings
 from fusion.odometry import OdometryIncrement
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory, checked_stamps
 
+__all__ = ["NOT_MEASURED", "REJECTED", "OdometryDrift", "SmootherResult", "SmootherSettings", "smooth"]
+
 _UNKNOWN_START = np.diag([9.0, 9.0, np.deg2rad(10.0) ** 2])  # of start values that come without covariances
-_WIDTHS = ()
-
-
-@dataclass(frozen=True, slots=True)
-class SmootherSettings:
-    """How the smoother behaves.
-
-    Parameters
-    ----------
-    outlier_probability : float
-        Prior chance that a measurement says nothing, in [0, 1).
-    clutter_log_density : float
-        ln density per m^2 rad of a measurement that is about nothing: `fusion.likelihood.log_uniform_density` of the
-        crop. The default is that of 40 m x 40 m with all headings.
-    odometry_kernel : {"huber", "dcs", "none"}
-        Robust loss of the odometry factors, for a registration that failed. Measurements have the null hypothesis.
-    odometry_kernel_width : float
-        Where that loss bends, in standard deviations.
-    max_iterations : int
-        Most rounds of choosing and optimising.
-
-    Raises
-    ------
-    SkyfixError
-        When a value is out of range.
-    """
-
-    outlier_probability: float = 0.05
-    clutter_log_density: float = -9.2
-    odometry_kernel: Literal["huber", "dcs", "none"] = "huber"
-    odometry_kernel_width: float = 4.0
-    max_iterations: int = 20
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.outlier_probability < 1.0:
-            raise SkyfixError(f"outlier_probability: expected in [0, 1), got {self.outlier_probability}")
-        if not np.isfinite(self.clutter_log_density):
-            raise SkyfixError(f"clutter_log_density: expected a number, got {self.clutter_log_density}")
-        if self.odometry_kernel not in ("huber", "dcs", "none"):
-            raise SkyfixError(f"odometry_kernel: expected huber, dcs or none, got {self.odometry_kernel!r}")
-        if not self.odometry_kernel_width > 0.0:
-            raise SkyfixError(f"odometry_kernel_width: expected > 0, got {self.odometry_kernel_width}")
-        if self.max_iterations < 1:
-            raise SkyfixError(f"max_iterations: expected >= 1, got {self.max_iterations}")
+_MOST_LAST_STEPS = 10
+_TOLERANCE = np.array([1e-5, 1e-5, 1e-6])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,8 +51,11 @@ class SmootherResult:
     converged : bool
         Whether the last round changed nothing to speak of.
     log_evidence : float
-        ln density of all measurements given the odometry, up to a constant, to compare smoothings of the same
-        measurements by.
+        ln density of all measurements given the odometry, up to a constant of the odometry's noise, to compare
+        smoothings of the same drive by.
+    calibrations, calibration_covariances : (S, 3), (S, 3, 3) float64
+        The odometry's ln scale, mounting yaw (rad) and heading bias (rad / m) on every stretch of road, when the
+        settings have a drift; S is 0 otherwise.
     """
 
     trajectory: Trajectory
@@ -95,6 +63,8 @@ class SmootherResult:
     iterations: int
     converged: bool
     log_evidence: float
+    calibrations: FloatArray
+    calibration_covariances: FloatArray
 
 
 def smooth(
@@ -102,7 +72,7 @@ def smooth(
     increments: Sequence[OdometryIncrement],
     measurements: Sequence[Measurement | None],
     prior: UniformPrior,
-    initial: Trajectory,
+    initial: Trajectory | Sequence[Trajectory],
     settings: SmootherSettings | None = None,
 ) -> SmootherResult:
     """Trajectory given all odometry and all measurements.
@@ -118,8 +88,9 @@ def smooth(
         correlated in time.
     prior : UniformPrior
         Of the first node; enters as the Gaussian with the box's mean and covariance.
-    initial : Trajectory
-        Start values covering the stamps, such as the filter's, and how far they can be trusted.
+    initial : Trajectory or sequence of them
+        Start values covering the stamps, such as the filter's, and how far they can be trusted. Of several, the one
+        with the highest evidence in the end wins.
     settings : SmootherSettings
         How the smoother behaves.
 
@@ -137,13 +108,52 @@ def smooth(
         )
     if any(increment.stamp_ns != stamp for increment, stamp in zip(increments, stamps[1:], strict=True)):
         raise SkyfixError("increments: expected one ending at every stamp after the first, got other stamps")
+    starts = [initial] if isinstance(initial, Trajectory) else list(initial)
+    if not starts:
+        raise SkyfixError("initial: expected at least one trajectory, got none")
     seen = Measurements(measurements, settings.outlier_probability, settings.clutter_log_density)
-    graph = PoseGraph(_chain(increments, prior, settings), len(stamps), is_chain=True)
-    poses, covariances = initial.interpolate(stamps), _covariances_near(stamps, initial)
-    found = propagate(graph, seen, poses, covariances, _WIDTHS, settings.max_iterations)
-    assert found.solution.covariances is not None  # every round asks for them
-    trajectory = Trajectory(stamps, found.solution.poses, found.solution.covariances)
-    return SmootherResult(trajectory, found.chosen, found.rounds, found.converged, found.log_evidence)
+    chain = Chain.of(increments)
+    kept = np.union1d(seen.nodes, [0, len(stamps) - 1])
+    graph = pose_graph(chain.between(kept), prior, settings)
+    among = seen.renumbered(np.searchsorted(kept, seen.nodes))
+    found = max(
+        (_from(start, stamps[kept], graph, among, settings.max_iterations) for start in starts),
+        key=lambda one: one.log_evidence,
+    )
+    poses = chain.filled(kept, found.solution.poses)
+    whole = graph if len(kept) == len(stamps) else pose_graph(chain, prior, settings)
+    last = _solved(whole, poses, seen.nodes, found.sites)
+    assert last.covariances is not None  # the last step gives them
+    assert last.calibration_covariances is not None
+    chosen = np.full(len(stamps), NOT_MEASURED, dtype=np.int64)
+    chosen[seen.nodes] = found.chosen
+    return SmootherResult(
+        Trajectory(stamps, last.poses, last.covariances),
+        chosen,
+        found.rounds,
+        found.converged,
+        found.log_evidence,
+        last.calibrations,
+        last.calibration_covariances,
+    )
+
+
+def _from(
+    start: Trajectory, stamps: IntArray, graph: PoseGraph, measurements: Measurements, max_rounds: int
+) -> Propagated:
+    poses, covariances = start.interpolate(stamps), _covariances_near(stamps, start)
+    return propagate(graph, measurements, poses, covariances, max_rounds)
+
+
+def _solved(graph: PoseGraph, poses: FloatArray, nodes: IntArray, sites: Sites) -> Solution:
+    """Steps to the end with the sites as they are."""
+    solution = graph.at(poses, nodes, sites)
+    for _ in range(_MOST_LAST_STEPS):
+        before = solution.poses
+        solution = graph.step(solution, nodes, sites, marginals=False)
+        if (np.abs(solution.poses - before).max(axis=0) < _TOLERANCE).all():
+            break
+    return graph.step(solution, nodes, sites)
 
 
 def _covariances_near(stamps: IntArray, initial: Trajectory) -> FloatArray:
@@ -152,21 +162,3 @@ def _covariances_near(stamps: IntArray, initial: Trajectory) -> FloatArray:
         return np.repeat(_UNKNOWN_START[None], len(stamps), axis=0)
     at = np.searchsorted(initial.stamp_ns, stamps, side="right") - 1
     return positive_definite(initial.covariances[np.maximum(at, 0)])
-
-
-def _chain(
-    increments: Sequence[OdometryIncrement], prior: UniformPrior, settings: SmootherSettings
-) -> gtsam.NonlinearFactorGraph:
-    """Prior and odometry."""
-    deltas = np.array([prior.mean, *(increment.delta for increment in increments)])
-    covariances = np.array([prior.covariance, *(increment.covariance for increment in increments)])
-    first, *noises = noises_of(covariances, deltas[:, 2])
-    graph = gtsam.NonlinearFactorGraph()
-    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*prior.mean), first))
-    width, kernels = settings.odometry_kernel_width, gtsam.noiseModel.mEstimator
-    if settings.odometry_kernel != "none":
-        kernel = kernels.Huber.Create(width) if settings.odometry_kernel == "huber" else kernels.DCS.Create(width)
-        noises = [gtsam.noiseModel.Robust.Create(kernel, noise) for noise in noises]
-    for node, ((x, y, yaw), noise) in enumerate(zip(deltas[1:].tolist(), noises, strict=True)):
-        graph.add(gtsam.BetweenFactorPose2(node, node + 1, gtsam.Pose2(x, y, yaw), noise))
-    return graph

@@ -94,17 +94,23 @@ class OdometryNoise:
 
     def covariance(self, delta: ArrayLike, seconds: float = 0.0) -> FloatArray:
         """Covariance (3, 3) of the increment `delta` (3,) that took `seconds`."""
-        x, y, turned = checked("delta", delta, (3,))
-        distance = float(np.hypot(x, y))
+        return self.covariances(checked("delta", delta, (3,))[None], np.array([seconds]))[0]
+
+    def covariances(self, deltas: ArrayLike, seconds: ArrayLike) -> FloatArray:
+        """Covariances (N, 3, 3) of the increments `deltas` (N, 3) that took `seconds` (N,)."""
+        deltas = checked("deltas", deltas, ("N", 3))
+        seconds = checked("seconds", seconds, (len(deltas),))
+        distance = np.hypot(deltas[:, 0], deltas[:, 1])
         heading = self.heading_rad_per_sqrt_m**2 * distance + self.heading_rad_per_sqrt_s**2 * seconds
-        heading += self.heading_rad_per_sqrt_rad**2 * abs(turned)
+        heading += self.heading_rad_per_sqrt_rad**2 * np.abs(deltas[:, 2])
         position = self.position_m_per_sqrt_s**2 * seconds
-        along = self.longitudinal_m_per_sqrt_m**2 * distance + position
-        across = self.lateral_m_per_sqrt_m**2 * distance + position + heading * distance**2 / 3.0
-        coupled = heading * distance / 2.0  # integral of a random walk: variance 1/3, covariance 1/2
-        covariance = np.array([[along, 0.0, 0.0], [0.0, across, coupled], [0.0, coupled, heading]])
-        turn = se2.rotation(np.arctan2(y, x))
-        return turn @ covariance @ turn.T
+        covariances = np.zeros((len(deltas), 3, 3))
+        covariances[:, 0, 0] = self.longitudinal_m_per_sqrt_m**2 * distance + position
+        covariances[:, 1, 1] = self.lateral_m_per_sqrt_m**2 * distance + position + heading * distance**2 / 3.0
+        covariances[:, 1, 2] = covariances[:, 2, 1] = heading * distance / 2.0  # integral of a random walk: 1/3, 1/2
+        covariances[:, 2, 2] = heading
+        turn = se2.rotation(np.arctan2(deltas[:, 1], deltas[:, 0]))
+        return np.asarray(turn @ covariances @ turn.swapaxes(1, 2))
 
 
 def increments_at(
@@ -133,10 +139,10 @@ def increments_at(
         raise SkyfixError("stamps: expected strictly increasing, got a repeat or a step back")
     poses = odometry.interpolate(stamps, tolerance_ns)
     deltas = se2.between(poses[:-1], poses[1:])
-    seconds = np.diff(stamps) * _NS
+    covariances = noise.covariances(deltas, np.diff(stamps) * _NS)
     return [
-        OdometryIncrement(int(stamp), delta, noise.covariance(delta, float(duration)))
-        for stamp, delta, duration in zip(stamps[1:], deltas, seconds, strict=True)
+        OdometryIncrement(int(stamp), delta, covariance)
+        for stamp, delta, covariance in zip(stamps[1:], deltas, covariances, strict=True)
     ]
 
 

@@ -1,46 +1,49 @@
-"""An odometry's constant errors, found from the drive itself: its clock, its headings' lead, its mounting, its scale.
+"""An odometry's errors, found from the drive itself: its clock, its headings' lead, its drift, and how noisy it is.
 
 An odometry comes from another pipeline than the scans. Its stamps are a tenth of a second off; headings taken from the
 tangent of a path run ahead of the vehicle; a camera looks a little to one side; a stereo baseline is one per cent
-short. None of these is noise: they do not average out, and each is a drift, or half a degree in every turn. With the
-right values odometry and map agree best, so the values are those that make the smoothed drive most probable, under a
-prior that holds them at zero where the drive tells nothing (in the spirit of Furgale, Rehder and Siegwart, "Unified
-temporal and spatial calibration for multi-sensor systems", IROS 2013).
+short, or a scale wanders. None of these is noise: they do not average out, and each is a drift, or half a degree in
+every turn. And how much noise is left differs tenfold from one pipeline to another.
+
+With the right values odometry and map agree best. So they are those under which the measurements are most probable
+(their evidence, everything else integrated out), with a prior that keeps them usual where the drive tells nothing.
+Scale, mounting and heading bias are states of the graph. What is left, clocks and sizes of noise, is searched for with
+the measurements' factors held, so that a trial is a linear problem; then the factors are found anew, once.
+
+Sources: Furgale, Rehder, Siegwart, "Unified temporal and spatial calibration for multi-sensor systems", IROS 2013;
+MacKay, "Bayesian interpolation", 1992 (evidence).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion import se2
-from fusion.arrays import FloatArray
-from fusion.factor_graph import SmootherSettings, smooth
-from fusion.gaussian_mixture import GaussianMixture
-from fusion.odometry import OdometryNoise, increments_at
+from fusion.arrays import FloatArray, IntArray
+from fusion.graph.assembly import pose_graph
+from fusion.graph.chain import Chain
+from fusion.graph.measurements import Measurement, Measurements
+from fusion.graph.odometry_drift import OdometryDrift
+from fusion.graph.propagation import Propagated, propagate
+from fusion.graph.smoother_settings import SmootherSettings
+from fusion.odometry import OdometryNoise
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory, checked_stamps
 
 _NS = 1_000_000_000
 _LARGEST_S = 0.45
-_DIRECTIONS = np.array(
-    [
-        [0.1, 0.0, 0.0, 0.0],  # the clock of positions and headings
-        [0.0, 0.1, 0.0, 0.0],  # that of the headings alone
-        [0.1, -0.1, 0.0, 0.0],  # that of the positions alone
-        [0.0, 0.0, 0.01, 0.0],
-        [0.0, 0.0, 0.0, 0.01],
-    ]
-)
-"""Steps of the search over the fields of an `OdometryCalibration`, in their order."""
-_SWEEPS = 2
+_ROUNDS = 3
+_CAUTION = 1.0  # ln of the factor by which the odometry is trusted less before its errors are known
+_LEAST_LOG_FACTORS = np.log([0.2, 0.2, 0.25, 0.1])  # jitter that comes and goes between measurements leaves no evidence
+_TRIAL_STEPS = 2
 _MOST_STEPS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryCalibration:
-    """Constant errors of an odometry, all zero where there are none.
+    """Errors of an odometry; without any, as it comes.
 
     Parameters
     ----------
@@ -52,12 +55,27 @@ class OdometryCalibration:
         Heading of its forward axis in the vehicle's body, radians counter-clockwise.
     log_scale : float
         ln of the true distance over the distance that it tells.
+    heading_lead_m : float
+        How far before its place, in metres: the tangent of the path of a sensor in front of the rear axle leads by
+        about their distance.
+    heading_bias_rad_per_m : float
+        What its heading lacks per metre.
+    along_noise, across_noise, heading_noise : float
+        Its noise over what was assumed, factors of standard deviations.
+    scale_walk : float
+        How its scale wanders over what was assumed, likewise.
     """
 
     clock_offset_s: float = 0.0
     heading_lead_s: float = 0.0
     mount_yaw_rad: float = 0.0
     log_scale: float = 0.0
+    heading_lead_m: float = 0.0
+    heading_bias_rad_per_m: float = 0.0
+    along_noise: float = 1.0
+    across_noise: float = 1.0
+    heading_noise: float = 1.0
+    scale_walk: float = 1.0
 
     def corrected(self, odometry: Trajectory) -> Trajectory:
         """The odometry of the vehicle's body, carried on at both ends as it last moved."""
@@ -66,36 +84,83 @@ class OdometryCalibration:
         first = max(at.span_ns[0], headings.span_ns[0])
         last = min(at.span_ns[1], headings.span_ns[1])
         stamps = np.union1d(np.clip(at.stamp_ns, first, last), [first, last])
-        xy = at.interpolate(stamps)[:, :2] * np.exp(self.log_scale)
-        yaw = headings.interpolate(stamps)[:, 2] - self.mount_yaw_rad
-        return Trajectory(stamps, np.column_stack([xy, se2.wrap(yaw)]), None, odometry.frame_id)
+        xy = np.exp(self.log_scale) * at.interpolate(stamps)[:, :2]
+        steps = np.diff(xy, axis=0)
+        way = np.append(0.0, np.cumsum(np.hypot(steps[:, 0], steps[:, 1])))
+        shown = np.unwrap(headings.interpolate(stamps)[:, 2])
+        yaw = np.interp(way - self.heading_lead_m, way, shown) if self.heading_lead_m else shown
+        turned = self.heading_bias_rad_per_m * way
+        bends = np.column_stack([np.zeros((len(steps), 2)), 0.5 * (turned[1:] + turned[:-1])])
+        xy = xy[0] + np.vstack([np.zeros(2), np.cumsum(se2.transform_points(bends, steps), axis=0)])
+        return Trajectory(
+            stamps, np.column_stack([xy, se2.wrap(yaw + turned - self.mount_yaw_rad)]), None, odometry.frame_id
+        )
+
+    def noise(self, assumed: OdometryNoise) -> OdometryNoise:
+        """The noise that it has, given what was assumed of it."""
+        return replace(
+            assumed,
+            longitudinal_m_per_sqrt_m=self.along_noise * assumed.longitudinal_m_per_sqrt_m,
+            lateral_m_per_sqrt_m=self.across_noise * assumed.lateral_m_per_sqrt_m,
+            heading_rad_per_sqrt_m=self.heading_noise * assumed.heading_rad_per_sqrt_m,
+            heading_rad_per_sqrt_rad=self.heading_noise * assumed.heading_rad_per_sqrt_rad,
+        )
+
+    def drift(self, assumed: OdometryDrift) -> OdometryDrift:
+        """How its errors change along the way, given what was assumed of that."""
+        return replace(assumed, log_scale_walk=self.scale_walk * assumed.log_scale_walk)
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPrior:
-    """Standard deviations of what an odometry's constant errors are before the drive is seen, about zero."""
+    """Standard deviations of what an odometry is like before the drive is seen.
+
+    Parameters
+    ----------
+    clock_offset_s, heading_lead_s, heading_lead_m : float
+        About zero.
+    log_noise : float
+        Of ln of the factors of noise and walk, about zero.
+    """
 
     clock_offset_s: float = 0.1
     heading_lead_s: float = 0.1
-    mount_yaw_rad: float = 0.01
-    log_scale: float = 0.015
+    heading_lead_m: float = 0.7
+    log_noise: float = 0.7
 
-    def cost(self, calibration: OdometryCalibration) -> float:
-        """Half a squared Mahalanobis distance from zero."""
-        return 0.5 * float(np.sum((np.array(astuple(calibration)) / np.array(astuple(self))) ** 2))
+    @property
+    def sigmas(self) -> FloatArray:
+        """(7,), of what is searched for."""
+        return np.array([self.clock_offset_s, self.heading_lead_s, self.heading_lead_m, *[self.log_noise] * 4])
+
+
+_DIRECTIONS = np.array(
+    [
+        [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # the clock of positions and headings
+        [0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0],  # the place of the headings,
+        [0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0],  # their clock,
+        [0.0, 0.1, -0.7, 0.0, 0.0, 0.0, 0.0],  # one for the other
+        [0.1, -0.1, 0.0, 0.0, 0.0, 0.0, 0.0],  # the clock of the positions alone
+        [0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0],  # ln of the factors: noise along,
+        [0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0],  # across,
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0],  # of the heading,
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.7],  # and the scale's walk
+    ]
+)
+"""Steps of the search."""
 
 
 def calibrate_odometry(
     stamps_ns: ArrayLike,
     odometry: Trajectory,
     noise: OdometryNoise,
-    measurements: Sequence[GaussianMixture],
+    measurements: Sequence[Measurement],
     prior: UniformPrior,
     initial: Trajectory,
     settings: SmootherSettings | None = None,
     calibration_prior: CalibrationPrior | None = None,
 ) -> OdometryCalibration:
-    """The most probable constant errors of an odometry, given what was measured along the drive.
+    """The most probable errors of an odometry, given what was measured along the drive.
 
     Parameters
     ----------
@@ -104,13 +169,15 @@ def calibrate_odometry(
     odometry : Trajectory
         In a frame of its own; it covers the stamps but for less than half a second.
     noise : OdometryNoise
-        Its random errors.
-    measurements : sequence of N GaussianMixture
-        Modes seen at each time, tempered for errors that are correlated in time.
-    prior, initial, settings
+        What is assumed of its random errors.
+    measurements : sequence of N Measurement
+        Tempered for errors that are correlated in time.
+    prior, initial
         As for `fusion.factor_graph.smooth`.
+    settings : SmootherSettings
+        As there; its drift is what is assumed of how scale, mounting and heading bias change, the default when None.
     calibration_prior : CalibrationPrior
-        How large constant errors are usually.
+        What errors are usual.
 
     Raises
     ------
@@ -118,17 +185,87 @@ def calibrate_odometry(
         As `smooth` does.
     """
     stamps = checked_stamps(stamps_ns)
-    before = calibration_prior or CalibrationPrior()
+    settings = settings or SmootherSettings()
+    if len(stamps) < 2:
+        return OdometryCalibration()
+    search = _Search(stamps, odometry, noise, prior, settings, settings.drift or OdometryDrift())
+    seen = Measurements(measurements, settings.outlier_probability, settings.clutter_log_density)
+    sigmas = (calibration_prior or CalibrationPrior()).sigmas
+    poses = initial.interpolate(stamps)
+    covariances = np.repeat(np.eye(3)[None], len(stamps), axis=0)
+    if initial.covariances is not None:
+        covariances = initial.covariances[np.searchsorted(initial.stamp_ns, stamps, side="right") - 1]
+    values = np.zeros(len(sigmas))
+    careful = np.array([0.0, 0.0, 0.0, *[_CAUTION] * 4])
+    found = search.propagated(careful, seen, poses, covariances)
+    for _ in range(_ROUNDS):
+        held = found
 
-    def cost(calibration: OdometryCalibration) -> float:
-        increments = increments_at(stamps, calibration.corrected(odometry), noise)
-        return smooth(stamps, increments, measurements, prior, initial, settings).log_evidence * -1.0 + before.cost(calibration)
+        def cost(tried: FloatArray, held: Propagated = held) -> float:
+            return 0.5 * float(((tried / sigmas) ** 2).sum()) - search.log_evidence(tried, held, seen.nodes)
 
-    found = np.zeros(4)
-    for _ in range(_SWEEPS):
         for step in _DIRECTIONS:
-            found = _best_along(step, found, lambda values: cost(_bounded(values)))
-    return _bounded(found)
+            values = _best_along(step, values, cost)
+        assert found.solution.covariances is not None  # every round asks for them
+        found = search.propagated(values, seen, found.solution.poses, found.solution.covariances)
+    log_scale, mount, bias = found.solution.calibrations.mean(axis=0).tolist()
+    calibration = _calibration(values)
+    return replace(calibration, log_scale=log_scale, mount_yaw_rad=mount, heading_bias_rad_per_m=bias)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Search:
+    """The drive as a function of what is searched for."""
+
+    stamps: IntArray
+    odometry: Trajectory
+    noise: OdometryNoise
+    prior: UniformPrior
+    settings: SmootherSettings
+    drift: OdometryDrift
+
+    def chain(self, calibration: OdometryCalibration) -> Chain:
+        """Motions between the measurements."""
+        poses = calibration.corrected(self.odometry).interpolate(self.stamps)
+        deltas = se2.between(poses[:-1], poses[1:])
+        noise = calibration.noise(self.noise)
+        return Chain(deltas, noise.covariances(deltas, np.diff(self.stamps) * 1e-9))
+
+    def propagated(
+        self, values: FloatArray, seen: Measurements, poses: FloatArray, covariances: FloatArray
+    ) -> Propagated:
+        """The smoothed drive."""
+        calibration = _calibration(values)
+        settings = replace(self.settings, drift=calibration.drift(self.drift))
+        graph = pose_graph(self.chain(calibration), self.prior, settings)
+        return propagate(graph, seen, poses, covariances, settings.max_iterations)
+
+    def log_evidence(self, values: FloatArray, held: Propagated, nodes: IntArray) -> float:
+        """ln density of the measurements, their factors as in `held`, up to a constant."""
+        calibration = _calibration(values)
+        drift, chain = calibration.drift(self.drift), self.chain(calibration)
+        graph = pose_graph(chain, self.prior, replace(self.settings, drift=drift))
+        solution = graph.at(held.solution.poses, nodes, held.sites)
+        for _ in range(_TRIAL_STEPS):
+            solution = graph.step(solution, nodes, held.sites, marginals=False)
+        log_scales = 0.5 * np.linalg.slogdet(chain.covariances)[1].sum()
+        log_scales += (len(solution.calibrations) - 1) * np.log(drift.step_sigmas).sum()
+        return -solution.cost - solution.half_log_det - float(log_scales)
+
+
+def _calibration(values: FloatArray) -> OdometryCalibration:
+    """That of values (7,) of the search; within what can be believed of an odometry."""
+    clock, lead = np.clip(values[:2], -_LARGEST_S, _LARGEST_S).tolist()
+    along, across, heading, walk = np.exp(np.maximum(values[3:], _LEAST_LOG_FACTORS)).tolist()
+    return OdometryCalibration(
+        clock,
+        lead,
+        heading_lead_m=float(values[2]),
+        along_noise=along,
+        across_noise=across,
+        heading_noise=heading,
+        scale_walk=walk,
+    )
 
 
 def _best_along(step: FloatArray, origin: FloatArray, cost: Callable[[FloatArray], float]) -> FloatArray:
@@ -144,13 +281,6 @@ def _best_along(step: FloatArray, origin: FloatArray, cost: Callable[[FloatArray
     bend = below - 2.0 * here + above
     vertex = origin + step * (best + (0.5 * (below - above) / bend if bend > 0.0 else 0.0))
     return vertex if cost(vertex) < here else origin + best * step
-
-
-def _bounded(values: FloatArray) -> OdometryCalibration:
-    """A calibration whose delays an odometry that is carried on by a second can follow."""
-    clock, lead, mount, log_scale = values.tolist()
-    clock = float(np.clip(clock, -_LARGEST_S, _LARGEST_S))
-    return OdometryCalibration(clock, float(np.clip(lead, -_LARGEST_S, _LARGEST_S)), mount, log_scale)
 
 
 def _delayed(odometry: Trajectory, seconds: float) -> Trajectory:

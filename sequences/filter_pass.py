@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from fusion.arrays import FloatArray
 from fusion.consistency import correlated_error_temperature
 from fusion.estimate import Estimate
-from fusion.modes import GaussianMixture
+from fusion.graph.patch import LikelihoodPatch
 from fusion.odometry import OdometryIncrement, accumulate
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.prior import UniformPrior
@@ -54,8 +54,9 @@ class FilterPass:
 
     Attributes
     ----------
-    estimates, rows, modes
-        One entry for every frame so far; the modes are None at frames without a measurement.
+    estimates, rows, patches
+        One entry for every frame so far; the patches of the likelihoods, for the smoother, are None at frames without
+        a measurement.
     best
         Frame number -> the measurement's own best pose (3,), at the measured frames.
     snapshots
@@ -83,7 +84,7 @@ class FilterPass:
     ) -> None:
         self.estimates: list[Estimate] = []
         self.rows: list[FrameRow] = []
-        self.modes: list[GaussianMixture | None] = []
+        self.patches: list[LikelihoodPatch | None] = []
         self.best: dict[int, FloatArray] = {}
         self.snapshots: list[Snapshot] = []
         self.log: list[str] = []
@@ -207,7 +208,7 @@ class FilterPass:
 
     def _keep(self, frame: int, estimate: Estimate, measurement: Measurement | None) -> None:
         self.estimates.append(estimate)
-        self.modes.append(None if measurement is None else measurement.modes(self._settings.modes))
+        self.patches.append(None if measurement is None else measurement.patch(estimate))
         if measurement is None:
             return
         self.best[frame] = measurement.best_pose()

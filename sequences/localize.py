@@ -1,7 +1,7 @@
 """Track a drive: the loop from a sequence, a matcher and an odometry to trajectories and numbers.
 
 Online, a particle filter is moved by the odometry and weighed by scans matched with the map (`filter_pass`);
-afterwards a factor graph smooths all frames at once from the same increments and the modes of the same likelihoods.
+afterwards a factor graph smooths all frames at once from the same odometry and the same likelihoods.
 Ground truth, where there is any, draws the start and scores the result; it is never tracked with.
 """
 
@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fusion.factor_graph import SmootherSettings, smooth
+from fusion.factor_graph import OdometryDrift, SmootherSettings, smooth
 from fusion.odometry import increments_at
 from fusion.odometry_calibration import calibrate_odometry
 from fusion.trajectory import Trajectory
@@ -88,13 +88,14 @@ def track(
         drive.stamps_ns[measured],
         odometry,
         settings.noise,
-        [modes for modes in online.modes if modes is not None],
+        [patch for patch in online.patches if patch is not None],
         prior,
         filtered,
         smoother_settings,
     )
-    motions = increments_at(drive.stamps_ns, calibration.corrected(odometry), settings.noise)
-    smoothed = smooth(drive.stamps_ns, motions, online.modes, prior, filtered, smoother_settings)
+    motions = increments_at(drive.stamps_ns, calibration.corrected(odometry), calibration.noise(settings.noise))
+    drifting = replace(smoother_settings, drift=calibration.drift(OdometryDrift()))
+    smoothed = smooth(drive.stamps_ns, motions, online.patches, prior, filtered, drifting)
     smoothing_s = time.perf_counter() - begin
     result = RunResult(
         sequence_name=sequence.name,

@@ -1,4 +1,4 @@
-"""One scan matched with the map, and what is kept of it: a volume is tens of megabytes, its modes are a few numbers."""
+"""One scan matched with the map, and what is kept of it: tens of megabytes become a few kilobytes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import numpy as np
 
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray
+from fusion.estimate import Estimate
+from fusion.graph.patch import LikelihoodPatch, Neighbourhood, patch_of
 from fusion.likelihood import LikelihoodVolume
-from fusion.modes import GaussianMixture
 from learned.matcher import SearchRegion
 
 _NEIGHBOURS = np.array([-1, 0, 1])
+_PATCH_SIGMAS, _PATCH_MARGIN_M, _PATCH_MARGIN_RAD = 4.0, 6.0, np.deg2rad(6.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,9 +38,13 @@ class Measurement:
     likelihood: LikelihoodVolume
     temperature: float
 
-    def modes(self, k: int) -> GaussianMixture:
-        """The at most `k` strongest modes of the likelihood, flattened by the temperature, for the smoother."""
-        return self.likelihood.modes(k).tempered(self.temperature)
+    def patch(self, estimate: Estimate) -> LikelihoodPatch:
+        """The likelihood around the filter's estimate, flattened by the temperature, for the smoother."""
+        sigma = _PATCH_SIGMAS * np.sqrt(np.diag(estimate.covariance))
+        half_extent_m = _PATCH_MARGIN_M + float(sigma[:2].max())
+        half_heading_rad = min(_PATCH_MARGIN_RAD + float(sigma[2]), np.pi)
+        around = Neighbourhood(estimate.pose, half_extent_m, half_heading_rad)
+        return patch_of(self.likelihood.tempered(self.temperature), around)
 
     def best_pose(self) -> FloatArray:
         """The matcher's own answer, see `best_pose`."""

@@ -50,8 +50,6 @@ class TrackSettings:
         OpenStreetMap is traced from aerial images that are a few decimetres off.
     outlier_probability
         Chance that a measurement says nothing about the pose.
-    modes
-        Gaussians kept of each measurement for the smoother.
     lost_threshold, patience
         A measurement agrees with the filter when it fits its prediction and leaves its lost score below the threshold.
         The search narrows after so many in a row that do, and widens after so many that do not.
@@ -78,7 +76,6 @@ class TrackSettings:
     correlation_length_m: float | None = None
     map_error_m: float = 0.4
     outlier_probability: float = 0.05
-    modes: int = 5
     lost_threshold: float = 0.5
     patience: int = 3
     snapshots: int = 6
@@ -90,7 +87,7 @@ class TrackSettings:
             numbers = value if isinstance(value, tuple) else (value,)
             if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
                 raise SkyfixError(f"{entry.name}: expected a finite number, got {value}")
-        positive = ("particles", "half_extent_m", "half_heading_deg", "modes", "patience", "search_sigmas")
+        positive = ("particles", "half_extent_m", "half_heading_deg", "patience", "search_sigmas")
         lengths = ("search_min_half_extent_m", "search_max_half_extent_m", "search_min_half_heading_deg")
         for name in (*positive, *lengths):
             if getattr(self, name) <= 0:

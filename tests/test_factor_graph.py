@@ -179,7 +179,7 @@ def test_a_failed_registration_is_bridged_by_a_robust_kernel(kernel):
         result = smooth(stamps, slipped, measurements, prior, rough(stamps, truth, spread=(0.3, 0.3, 0.02)), settings)
         return np.abs(errors_of(result, truth)[35:55, :2]).max()
 
-    assert worst(kernel) < 0.7 * worst("none")
+    assert worst(kernel) < 0.75 * worst("none")
 
 
 def test_without_measurements_it_is_the_odometry_from_the_prior():

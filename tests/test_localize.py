@@ -16,6 +16,7 @@ from made_drive import STEP_M, EmulatedMatcher, MadeDrive, made_scan
 import sequences.run_directory as run_directory
 from fusion import se2
 from fusion.errors import SkyfixError
+from fusion.estimate import Estimate
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
 from fusion.trajectory import Trajectory
@@ -313,21 +314,18 @@ def test_a_run_that_cannot_be_written_leaves_nothing(
     assert list((tmp_path / "runs").iterdir()) == []
 
 
-def test_modes_for_the_smoother_are_flattened_one_by_one() -> None:
+def test_patches_for_the_smoother_are_the_flattened_likelihood_near_the_estimate() -> None:
     grid = MapGrid(80, 80, 0.5, -20.0, -20.0)
     x, y = grid.centres()
     bins = np.arange(120) * 2.0 * np.pi / 120
-
-    def bump(at_x: float, weight: float) -> np.ndarray:
-        squared = ((x[None, :, None] - at_x) ** 2 + y[:, None, None] ** 2) / 0.8**2 + (se2.wrap(bins) / 0.1) ** 2
-        return weight * np.exp(-0.5 * squared)
-
-    volume = LikelihoodVolume.from_scores(np.log(bump(-8.0, 0.9) + bump(8.0, 0.1) + 1e-12), grid)
-    search = SearchRegion(np.zeros(3), 10.0)
+    squared = (x[None, :, None] ** 2 + y[:, None, None] ** 2) / 0.8**2 + (se2.wrap(bins) / 0.1) ** 2
+    volume = LikelihoodVolume.from_scores(-0.5 * np.minimum(squared, 30.0), grid)
     scan = np.zeros((1, 4), np.float32)
-    sharp, flat = (Measurement(scan, search, volume, temperature).modes(5) for temperature in (1.0, 4.0))
-    np.testing.assert_allclose(sharp.weights, [0.9, 0.1], atol=0.01)
-    np.testing.assert_allclose(flat.means, sharp.means)
-    np.testing.assert_allclose(flat.covariances, 4.0 * sharp.covariances)
-    assert flat.weights.sum() == pytest.approx(sharp.weights.sum())
-    assert flat.weights[0] / flat.weights[1] == pytest.approx(9.0**0.25, rel=0.01)
+    estimate = Estimate(0, np.array([1.0, -2.0, 0.05]), np.diag([0.5, 0.5, 0.02]) ** 2, None, 1.0, 0.0, 0.0)
+    patch = Measurement(scan, SearchRegion(np.zeros(3), 10.0), volume, 4.0).patch(estimate)
+    assert patch.log_prob.size < volume.log_prob.size / 20
+    x, y = patch.grid.centres()
+    yaw = (patch.first_bin + np.arange(patch.log_prob.shape[2])) * 2.0 * np.pi / patch.bin_count
+    poses = np.stack(np.meshgrid(y, x, yaw, indexing="ij"), axis=-1)[..., [1, 0, 2]].reshape(-1, 3)
+    np.testing.assert_allclose(patch.log_prob.ravel(), volume.tempered(4.0).log_density(poses), atol=1e-4)
+    assert np.abs(poses - estimate.pose).max(axis=0)[:2].min() > 4.0 * 0.5

@@ -1,75 +1,87 @@
-"""Marginal covariances of a chain from its Bayes net, backward: each pose given the next one.
+"""Marginal covariances of a chain from its Bayes net, backward: each variable given the ones after it.
 
-Source: Golub, Plemmons, "Large-scale geodetic least-squares adjustment by dissection and orthogonal decomposition",
-1980; Kaess, Dellaert, "Covariance recovery from a square root information matrix for data association", 2009.
+A conditional says ``R x + S y = d + e`` with unit errors e, so that with the covariance J of what comes after
+
+    cov(x) = R^-1 (1 + S J S^T) R^-T,    cov(x, y) = -R^-1 S J.
+
+In a chain of poses with calibrations the variables after are never more than one pose and one calibration: two slots.
+
+Source: Kaess, Dellaert, "Covariance recovery from a square root information matrix for data association", 2009.
 """
-
-from collections.abc import Sequence
 
 import gtsam
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.arrays import FloatArray
+from fusion.arrays import FloatArray, IntArray
+
+_WIDTH = 6
 
 
-def chain_covariances(bayes_net: gtsam.GaussianBayesNet) -> FloatArray:
-    """Covariances (N, d, d) of a chain that was eliminated from its first variable to its last."""
-    conditionals: Sequence[gtsam.GaussianConditional] = [bayes_net.at(k) for k in range(bayes_net.size())]
-    roots = np.array([conditional.R() for conditional in conditionals])
-    links = np.zeros_like(roots)
-    if len(conditionals) > 1:
-        links[:-1] = [conditional.S() for conditional in conditionals[:-1]]
+def chain_covariances(bayes_net: gtsam.GaussianBayesNet, slots: IntArray) -> FloatArray:
+    """Covariances (V, 3, 3) of the variables in the order in which they were eliminated.
+
+    Parameters
+    ----------
+    bayes_net : gtsam.GaussianBayesNet
+        Of V variables of 3 dimensions.
+    slots : (V,) int64
+        0 for a pose, 1 for a calibration; a conditional's parents are the nearest pose after it, and, where there are
+        any, the nearest calibration.
+    """
+    roots = np.empty((len(slots), 3, 3))
+    links = np.zeros((len(slots), 3, _WIDTH))
+    for k in range(len(slots)):
+        conditional = bayes_net.at(k)
+        roots[k] = conditional.R()
+        link = conditional.S()
+        links[k, :, : link.shape[1]] = link
     covariances = np.empty_like(roots)
-    _backward(roots, links, covariances)
+    _backward(roots, links, slots, covariances)
     return covariances
 
 
 @numba.njit(cache=True, nogil=True)
 def _backward(
-    roots: NDArray[np.float64], links: NDArray[np.float64], covariances: NDArray[np.float64]
+    roots: NDArray[np.float64], links: NDArray[np.float64], slots: NDArray[np.int64], covariances: NDArray[np.float64]
 ) -> None:
-    """``R_k x_k + S_k x_k+1 = d + e`` with unit errors e: ``C_k = R^-1 (1 + S C_k+1 S^T) R^-T``; R upper triangular."""
-    count, size = roots.shape[0], roots.shape[1]
-    noise, inverse = np.empty((size, size)), np.empty((size, size))
-    half = np.empty((size, size))
-    for k in range(count - 1, -1, -1):
-        root, link = roots[k], links[k]
-        for j in range(size):
-            for i in range(size):
-                inverse[i, j] = 0.0
+    joint = np.zeros((_WIDTH, _WIDTH))  # of the nearest pose and calibration after
+    inverse, gain = np.zeros((3, 3)), np.empty((3, _WIDTH))
+    cross = np.empty((3, _WIDTH))
+    for k in range(len(roots) - 1, -1, -1):
+        root = roots[k]
+        for j in range(3):
             for i in range(j, -1, -1):
                 total = 1.0 if i == j else 0.0
                 for m in range(i + 1, j + 1):
                     total -= root[i, m] * inverse[m, j]
                 inverse[i, j] = total / root[i, i]
-        for i in range(size):
-            for j in range(size):
-                noise[i, j] = 1.0 if i == j else 0.0
-        if k < count - 1:
-            after = covariances[k + 1]
-            for i in range(size):
-                for j in range(size):
-                    total = 0.0
-                    for m in range(size):
-                        total += link[i, m] * after[m, j]
-                    half[i, j] = total
-            for i in range(size):
-                for j in range(size):
-                    total = 0.0
-                    for m in range(size):
-                        total += half[i, m] * link[j, m]
-                    noise[i, j] += total
-        for i in range(size):
-            for j in range(size):
+        for i in range(3):
+            for j in range(_WIDTH):
                 total = 0.0
-                for m in range(size):
-                    total += inverse[i, m] * noise[m, j]
-                half[i, j] = total
-        for i in range(size):
-            for j in range(size):
+                for m in range(i, 3):
+                    total -= inverse[i, m] * links[k, m, j]
+                gain[i, j] = total
+        for i in range(3):
+            for j in range(_WIDTH):
                 total = 0.0
-                for m in range(size):
-                    total += half[i, m] * inverse[j, m]
+                for m in range(_WIDTH):
+                    total += gain[i, m] * joint[m, j]
+                cross[i, j] = total
+        for i in range(3):
+            for j in range(3):
+                total = 0.0
+                for m in range(3):
+                    total += inverse[i, m] * inverse[j, m]
+                for m in range(_WIDTH):
+                    total += cross[i, m] * gain[j, m]
                 covariances[k, i, j] = total
+        begin = 3 * slots[k]
+        for i in range(3):
+            for j in range(_WIDTH):
+                joint[begin + i, j] = cross[i, j]
+                joint[j, begin + i] = cross[i, j]
+        for i in range(3):
+            for j in range(3):
+                joint[begin + i, begin + j] = covariances[k, i, j]

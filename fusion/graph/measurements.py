@@ -1,6 +1,7 @@
 """Measurements: what was seen along a drive, whole likelihoods and Gaussian mixtures alike."""
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
@@ -46,29 +47,27 @@ class Measurements:
                 is_patch = isinstance(measurement, LikelihoodPatch)
                 patches[node] = measurement if is_patch else patch_of(measurement)
         self.nodes: IntArray = np.array([*mixtures, *patches], dtype=np.int64)
-        self._count, self._outlier = len(measurements), outlier_probability
         self._mixtures = MixtureBank(list(mixtures.values()), outlier_probability, clutter_log_density)
         self._bank = LikelihoodBank(list(patches.values()), outlier_probability)
 
     def __len__(self) -> int:
         return len(self.nodes)
 
-    @property
-    def are_gaussian(self) -> bool:
-        """Whether each is a single Gaussian that is certainly right: a linear problem but for the headings."""
-        return self._outlier == 0.0 and len(self._bank) == 0 and self._mixtures.width == 1
+    def renumbered(self, nodes: IntArray) -> "Measurements":
+        """The same measurements on other nodes (M,)."""
+        same = copy(self)
+        same.nodes = nodes
+        return same
 
     def windowed(self, centres: FloatArray, covariances: FloatArray) -> tuple[Windowed, IntArray]:
-        """Moments under windows (M, 3) and (M, 3, 3); and for each node (N,) the component that explains it best.
+        """Moments under windows (M, 3) and (M, 3, 3); and for each (M,) the component that explains it best.
 
-        That is 0 for a whole likelihood, REJECTED where an outlier explains better, NOT_MEASURED elsewhere.
+        That is 0 for a whole likelihood, and REJECTED where an outlier explains better.
         """
         split = len(self._mixtures)
         mixed, best = self._mixtures.windowed(centres[:split], covariances[:split])
         whole = self._bank.windowed(centres[split:], covariances[split:])
-        chosen = np.full(self._count, NOT_MEASURED, dtype=np.int64)
-        chosen[self.nodes[:split]] = best
-        chosen[self.nodes[split:]] = np.where(self._bank.outlier_share(whole.log_mass) > 0.5, REJECTED, 0)
+        chosen = np.append(best, np.where(self._bank.outlier_share(whole.log_mass) > 0.5, REJECTED, 0))
         if split == 0 or split == len(self):
             return (whole if split == 0 else mixed), chosen
         names = ("roots", "log_mass", "means", "spreads", "flat")

@@ -8,8 +8,8 @@ p and the clutter density. Under a window ``N(c, W)`` they have the evidence
 With the rest of a graph as the window (the cavity), this judges a mode by where everything else puts the pose. Judging
 it at the estimate itself would reject every mode that the estimate is not yet drawn to.
 
-Source: Olson, Agarwal, "Inference on networks of mixtures for robust robot mapping", RSS 2012 (null hypothesis); sums in
-place of their maxima.
+Source: Olson, Agarwal, "Inference on networks of mixtures for robust robot mapping", RSS 2012 (null
+hypothesis); sums in place of their maxima.
 """
 
 from collections.abc import Sequence
@@ -54,11 +54,6 @@ class MixtureBank:
 
     def __len__(self) -> int:
         return len(self._log_weights)
-
-    @property
-    def width(self) -> int:
-        """Number K of components."""
-        return self._log_weights.shape[1]
 
     def windowed(self, centres: FloatArray, covariances: FloatArray) -> tuple[Windowed, IntArray]:
         """Moments under windows (M, 3) and (M, 3, 3), and the best component of each, -1 for clutter."""

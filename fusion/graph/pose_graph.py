@@ -1,7 +1,7 @@
 """PoseGraph: the factors that are not measurements of the map, and damped Gauss-Newton steps with those that are.
 
-GTSAM linearises and solves; the measurements come as quadratics, one Hessian factor a node, so that no callback from
-GTSAM into Python is ever made.
+GTSAM linearises its own factors and solves; the measurements come as quadratics, one Hessian factor a node, and an
+odometry that is to be calibrated as Jacobian factors, so that no callback from GTSAM into Python is ever made.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ import numpy as np
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
 from fusion.errors import SkyfixError
+from fusion.graph.calibration_walk import CalibrationWalk
 from fusion.graph.chain_marginals import chain_covariances
 from fusion.graph.covariances import positive_definite, turned
 from fusion.graph.sites import Sites
@@ -30,17 +31,23 @@ class Solution:
         Poses by node.
     poses : (N, 3) float64
         The same.
+    calibrations : (S, 3) float64
+        See `fusion.graph.odometry_factors`; S is 0 where the odometry is taken as it is.
     covariances : (N, 3, 3) float64
         Marginals on the axes of the map, linearised one step before `poses`; None when they were not asked for.
+    calibration_covariances : (S, 3, 3) float64
+        Of the calibrations, likewise.
     cost : float
-        Minus the log posterior density at the poses, up to a constant.
+        Minus the log posterior density, up to a constant.
     half_log_det : float
         Half ln of the determinant of the information.
     """
 
     values: gtsam.Values
     poses: FloatArray
+    calibrations: FloatArray
     covariances: FloatArray | None
+    calibration_covariances: FloatArray | None
     cost: float
     half_log_det: float
 
@@ -51,25 +58,32 @@ class PoseGraph:
     Parameters
     ----------
     graph : gtsam.NonlinearFactorGraph
-        All factors but the measurements'.
+        All factors but the measurements' and those in `walk`.
     count : int
         N.
     is_chain : bool
         Whether every factor stands on one pose or on two neighbours.
+    walk : CalibrationWalk, optional
+        The odometry and its calibrations, keys N to N + S - 1, when it is to be calibrated.
     """
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, count: int, is_chain: bool) -> None:
-        self._graph, self._count, self._is_chain = graph, count, is_chain
-        self._order = gtsam.Ordering()
-        for node in range(count):
-            self._order.push_back(node)
+    def __init__(
+        self, graph: gtsam.NonlinearFactorGraph, count: int, is_chain: bool, walk: CalibrationWalk | None = None
+    ) -> None:
+        self._graph, self._count, self._is_chain, self._walk = graph, count, is_chain, walk
+        keys = np.arange(count) if walk is None else walk.elimination_order()
+        self._keys, self._order, self._slots = keys, gtsam.Ordering(), (keys >= count).astype(np.int64)
+        for key in keys.tolist():
+            self._order.push_back(key)
 
     def at(self, poses: FloatArray, nodes: IntArray, sites: Sites) -> Solution:
         """The graph at poses (N, 3), before any step."""
         values = gtsam.Values()
         for node, (x, y, yaw) in enumerate(poses.tolist()):
             values.insert(node, gtsam.Pose2(x, y, yaw))
-        return Solution(values, poses, None, self._cost(values, poses, nodes, sites), 0.0)
+        calibrations = np.zeros((0 if self._walk is None else self._walk.count, 3))
+        cost = self._cost(values, poses, calibrations, nodes, sites)
+        return Solution(values, poses, calibrations, None, None, cost, 0.0)
 
     def step(self, before: Solution, nodes: IntArray, sites: Sites, marginals: bool = True) -> Solution:
         """A Gauss-Newton step, halved until the cost does not grow.
@@ -79,44 +93,61 @@ class PoseGraph:
         SkyfixError
             When the graph cannot be solved or the solution is not finite.
         """
-        linear = self._graph.linearize(before.values)
-        own = sites.about(before.poses[nodes])
-        turn = se2.rotation(before.poses[nodes, 2])
-        back = turn.swapaxes(1, 2)
-        precision = back @ own.precision @ turn
-        information = np.einsum("mij,mj->mi", back, own.information)
-        for node, matrix, vector in zip(nodes.tolist(), precision, information, strict=True):
-            linear.push_back(gtsam.HessianFactor(node, matrix, vector, 0.0))
+        linear = self._linearised(before, nodes, sites)
         try:
             bayes_net = linear.eliminateSequential(self._order)
             delta = bayes_net.optimize()
-            covariances = self._covariances(linear, bayes_net, before.values) if marginals else None
+            covariances = self._covariances(linear, bayes_net, before) if marginals else None
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[0]
             raise SkyfixError(f"smoother: expected a solvable graph, got {reason}") from error
-        if covariances is not None:
-            covariances = positive_definite(turned(covariances, before.poses[:, 2]))
-        cost = self._cost(before.values, before.poses, nodes, sites)
-        half_log_det = float(bayes_net.logDeterminant())
-        values, poses, reached = before.values, before.poses, np.inf
+        keys = range(self._count, self._count + len(before.calibrations))
+        turns = np.array([delta.at(key) for key in keys]).reshape(-1, 3)
+        cost = self._cost(before.values, before.poses, before.calibrations, nodes, sites)
+        values, poses, calibrations, reached = before.values, before.poses, before.calibrations, np.inf
         for halving in range(_HALVINGS):
             values = before.values.retract(delta.scale(0.5**halving))
             poses = np.array(gtsam.utilities.extractPose2(values)).reshape(-1, 3)
-            reached = self._cost(values, poses, nodes, sites)
+            calibrations = before.calibrations + 0.5**halving * turns
+            reached = self._cost(values, poses, calibrations, nodes, sites)
             if reached <= cost + _SLACK * (1.0 + abs(cost)):
                 break
         finite = np.isfinite(reached) and np.isfinite(poses).all()
         if not finite or (covariances is not None and not np.isfinite(covariances).all()):
             raise SkyfixError("smoother: expected a finite solution, got NaN or an infinity")
-        return Solution(values, poses, covariances, reached, half_log_det)
+        half_log_det = float(bayes_net.logDeterminant())
+        if covariances is None:
+            return Solution(values, poses, calibrations, None, None, reached, half_log_det)
+        own = positive_definite(turned(covariances[: self._count], before.poses[:, 2]))
+        return Solution(values, poses, calibrations, own, covariances[self._count :], reached, half_log_det)
 
-    def _cost(self, values: gtsam.Values, poses: FloatArray, nodes: IntArray, sites: Sites) -> float:
-        return float(self._graph.error(values)) + float(sites.costs(poses[nodes]).sum())
+    def _linearised(self, at: Solution, nodes: IntArray, sites: Sites) -> gtsam.GaussianFactorGraph:
+        linear = self._graph.linearize(at.values)
+        own = sites.about(at.poses[nodes])
+        turn = se2.rotation(at.poses[nodes, 2])
+        back = turn.swapaxes(1, 2)
+        precision = back @ own.precision @ turn
+        information = np.einsum("mij,mj->mi", back, own.information)
+        for node, matrix, vector in zip(nodes.tolist(), precision, information, strict=True):
+            linear.push_back(gtsam.HessianFactor(node, matrix, vector, 0.0))
+        if self._walk is not None:
+            self._walk.add_to(linear, at.poses, at.calibrations)
+        return linear
+
+    def _cost(
+        self, values: gtsam.Values, poses: FloatArray, calibrations: FloatArray, nodes: IntArray, sites: Sites
+    ) -> float:
+        walked = 0.0 if self._walk is None else self._walk.cost(poses, calibrations)
+        return float(self._graph.error(values)) + float(sites.costs(poses[nodes]).sum()) + walked
 
     def _covariances(
-        self, linear: gtsam.GaussianFactorGraph, bayes_net: gtsam.GaussianBayesNet, values: gtsam.Values
+        self, linear: gtsam.GaussianFactorGraph, bayes_net: gtsam.GaussianBayesNet, at: Solution
     ) -> FloatArray:
-        if self._is_chain:
-            return chain_covariances(bayes_net)
-        marginals = gtsam.Marginals(linear, values)
-        return np.array([marginals.marginalCovariance(node) for node in range(self._count)])
+        """In the order of the keys, poses on the axes of the body."""
+        size = self._count + len(at.calibrations)
+        if not self._is_chain:
+            marginals = gtsam.Marginals(linear, bayes_net.optimize())
+            return np.array([marginals.marginalCovariance(key) for key in range(size)])
+        found = np.empty((size, 3, 3))
+        found[self._keys] = chain_covariances(bayes_net, self._slots)
+        return found

@@ -5,13 +5,9 @@ else says of the pose; the likelihood times the cavity has a mass, a mean and a 
 Gaussian that, times the cavity, has the same. Broad, flat, skewed and many-peaked likelihoods count for what they are
 under that window, and a likelihood that is somewhere else altogether counts for nothing: it is an outlier.
 
-In the first rounds the windows are wider than the cavities (graduated), so that a start many metres off still sees
-the right peaks.
-
 Source: Minka, "Expectation propagation for approximate Bayesian inference", UAI 2001; the evidence is its equation 20.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +32,7 @@ class Propagated:
         Poses and marginals.
     sites : Sites
         Factors of the measurements.
-    chosen : (N,) int64
+    chosen : (M,) int64
         See `Measurements.windowed`.
     log_evidence : float
         ln density of all measurements, up to a constant of the graph.
@@ -59,32 +55,24 @@ def propagate(
     measurements: Measurements,
     poses: FloatArray,
     covariances: FloatArray,
-    widths: Sequence[FloatArray],
     max_rounds: int,
 ) -> Propagated:
-    """Run to convergence from poses (N, 3) whose errors have covariances (N, 3, 3).
-
-    Parameters
-    ----------
-    widths : sequence of (3, 3) float64
-        Added to the windows' covariances in the first rounds, one after the other.
-    """
+    """Run to convergence from poses (N, 3) whose errors have covariances (N, 3, 3)."""
     nodes = measurements.nodes
     centres, windows = poses[nodes], covariances[nodes]
     sites = no_sites(centres)
     solution = graph.at(poses, nodes, sites)
     rounds, converged = 0, False
     while not converged and rounds < max_rounds:
-        widened = windows + widths[rounds] if rounds < len(widths) else windows
-        found, _ = measurements.windowed(centres, widened)
+        found, _ = measurements.windowed(centres, windows)
         fresh = Sites(centres, *found.factors())
-        sites = sites.mixed(fresh, 1.0 if rounds <= len(widths) else _DAMPING)
+        sites = sites.mixed(fresh, _DAMPING if rounds else 1.0)
         before = solution.poses
         solution = graph.step(solution, nodes, sites)
         moved = np.abs(solution.poses - before).max(axis=0)
         rounds += 1
         settled = moved[:2].max() < _POSITION_TOLERANCE_M and moved[2] < _HEADING_TOLERANCE_RAD
-        converged = bool(settled and rounds > len(widths) + 1)
+        converged = bool(settled and rounds > 1)
         assert solution.covariances is not None  # asked for
         centres, windows = sites.cavities(solution.poses[nodes], solution.covariances[nodes])
     found, chosen = measurements.windowed(centres, windows)

@@ -84,7 +84,7 @@ def expansion_at(
     gradient: NDArray[np.float64],
     hessian: NDArray[np.float64],
 ) -> float:
-    """Value at a position inside of the cells; writes the gradient (3,) and Hessian (3, 3) per cell (row, col, turn)."""
+    """Value at a position among the cells; writes the gradient (3,) and Hessian (3, 3) by (row, col, turn)."""
     middle = np.empty(3, np.int64)
     weights = np.empty((3, 3, 3))  # axis, derivative, cell
     for axis in range(3):
