@@ -1,8 +1,9 @@
-"""The map of a world as an aerial image shows it, segmented: what lies on top, in blobs.
+"""Maps of a world that are not drawn by surveyors: what an aerial image shows, segmented, or where one can drive.
 
 OpenStreetMap draws what surveyors find worth drawing; a segmented aerial image shows every crown and hedge, hides what
 is below them, and knows neither walls nor fences nor kinds of ground. A network that has seen only the former takes the
-latter's vegetation for woods with free edges.
+latter's vegetation for woods with free edges. Maps for driving (nuScenes) may show the carriageway alone, but all of
+it, where OpenStreetMap has a line in its middle.
 """
 
 from __future__ import annotations
@@ -51,18 +52,24 @@ def overhead_map(world: World, grid: MapGrid, offset_m: float, rng: np.random.Ge
     shows_grass = rng.random() < 0.5
     top = _on_top(world)
     scores = np.empty((len(_SHOWN), grid.rows, grid.cols), dtype=np.float32)
-    affine = _to_map(world.grid, grid, shift)
     for number, name in enumerate(_SHOWN):
         share = cv2.GaussianBlur((top == CLASS_INDEX[name]).astype(np.float32), (0, 0), smear_px)
-        seen = cv2.warpAffine(
-            share, affine, (grid.cols, grid.rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
+        seen = _sampled(share, world.grid, grid, shift)
         scores[number] = seen + noise * (seen > 0.01) * smooth_noise(grid, 3.0, rng)
     if not shows_grass:  # ground is ground, whatever grows on it
         scores[0] += scores[_SHOWN.index("grass")]
         scores[_SHOWN.index("grass")] = -np.inf
     classes = np.array([CLASS_INDEX[name] for name in _SHOWN], dtype=np.uint8)[scores.argmax(axis=0)]
+    return MapRaster.from_classes(grid, classes)
+
+
+def drivable_map(world: World, grid: MapGrid, offset_m: float, rng: np.random.Generator) -> MapRaster:
+    """Where one can drive, surveyed to a pixel, whatever stands there; parameters as for `overhead_map`."""
+    shift = rng.normal(0.0, offset_m, 2) / world.grid.metres_per_pixel
+    paved = np.isin(world.material, (Material.ROAD, Material.CAR)).astype(np.uint8)
+    seen = cv2.morphologyEx(paved, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))  # poles are no holes
+    here = _sampled(seen.astype(np.float32), world.grid, grid, shift) > 0.5
+    classes = np.where(here, CLASS_INDEX["road"], CLASS_INDEX["void"]).astype(np.uint8)
     return MapRaster.from_classes(grid, classes)
 
 
@@ -78,9 +85,15 @@ def _on_top(world: World) -> NDArray[np.uint8]:
     return top
 
 
-def _to_map(world: MapGrid, grid: MapGrid, shift_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Affine (2, 3) from the map's pixels (column, row; integers at centres) to the world's, shifted by some cells."""
+def _sampled(
+    layer: NDArray[np.float32], world: MapGrid, grid: MapGrid, shift_px: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """A layer of the world, shifted by some of its cells, at the map's pixels."""
     scale = grid.metres_per_pixel / world.metres_per_pixel
-    corner = grid.xy_from_pixel(np.array([0.5, 0.5]))  # middle of the map's first pixel
-    row, col = world.pixel_from_xy(corner) - 0.5
-    return np.array([[scale, 0.0, col + shift_px[0]], [0.0, scale, row + shift_px[1]]])
+    row, col = world.pixel_from_xy(grid.xy_from_pixel(np.array([0.5, 0.5]))) - 0.5  # OpenCV has centres at integers
+    affine = np.array([[scale, 0.0, col + shift_px[0]], [0.0, scale, row + shift_px[1]]])
+    sampled = cv2.warpAffine(
+        layer, affine, (grid.cols, grid.rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return np.asarray(sampled, dtype=np.float32)

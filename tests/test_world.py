@@ -13,7 +13,7 @@ from learned.map_raster import CLASS_INDEX, MapRaster
 from sequences import paint
 from sequences.osm import Area, Line, MapFeatures, rasterise
 from sequences.world import Material, World, WorldStyle, build_area, sample_road_poses, world_from_raster
-from sequences.world_overhead import overhead_map
+from sequences.world_overhead import drivable_map, overhead_map
 
 GRID = MapGrid(240, 240, 0.5, -60.0, -60.0)
 BARE = WorldStyle(
@@ -266,3 +266,12 @@ def test_from_above_is_decided_by_the_generator_and_shifted_as_asked() -> None:
         middles.append(0.5 * np.argwhere(classes == CLASS_INDEX["building"]).mean(axis=0))
     spread = np.std(middles, axis=0)  # metres; of 60 draws the estimate is within 1.0 of 2.0 with more than 5 sigma
     assert (np.abs(spread - 2.0) < 1.0).all()
+
+
+def test_where_one_can_drive_is_all_that_such_a_map_shows() -> None:
+    world, _ = build_area(TOWN, GRID, replace(BARE, poles_per_100m=20.0), np.random.default_rng(0))
+    shown = drivable_map(world, GRID, 0.0, np.random.default_rng(0)).classes
+    assert shown is not None
+    assert set(np.unique(shown)) == {CLASS_INDEX["void"], CLASS_INDEX["road"]}
+    paved_m2 = 0.25 * np.count_nonzero(shown == CLASS_INDEX["road"])
+    assert paved_m2 == pytest.approx(120.0 * 13.0 - 42.0 + 900.0, rel=0.05)  # both roads and the car park, no holes
