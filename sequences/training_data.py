@@ -23,6 +23,7 @@ from sequences.lidar import LidarModel, simulate_scan
 from sequences.osm import MapFeatures
 from sequences.sample_cache import claim_cache
 from sequences.world import World, build_area, sample_road_poses
+from sequences.world_overhead import drivable_map, overhead_map
 from sequences.world_style import WorldStyle
 
 _ATTEMPTS = 60
@@ -51,6 +52,10 @@ class SimulationSettings:
         Beams of one elevation per simulated revolution: drawn from this range for each area.
     least_buildings
         Neighbourhoods with fewer are passed over, nine times out of ten.
+    overhead_share
+        Share of neighbourhoods whose map is what an aerial image shows, segmented, instead of OpenStreetMap's.
+    drivable_share
+        Share of those whose map shows carriageways alone, with their full width.
     """
 
     samples: int = 16000
@@ -61,6 +66,8 @@ class SimulationSettings:
     bev_half_extent_m: float = 40.0
     azimuths: tuple[int, int] = (900, 2000)
     least_buildings: int = 5
+    overhead_share: float = 0.0
+    drivable_share: float = 0.0
     seed: int = 0
 
 
@@ -169,7 +176,12 @@ class SimulatedSamples:
             here = features.within(grid)
             if sum(area.kind == "building" for area in here.areas) < settings.least_buildings and rng.random() < 0.9:
                 continue
-            world, map_raster = build_area(features, grid, WorldStyle.random(rng), rng)
+            style = WorldStyle.random(rng)
+            world, map_raster = build_area(features, grid, style, rng)
+            if settings.overhead_share > 0 and rng.random() < settings.overhead_share:
+                only_drivable = rng.random() < settings.drivable_share
+                draw = drivable_map if only_drivable else overhead_map
+                map_raster = draw(world, grid, style.map_offset_m, rng)
             margin = settings.area_half_extent_m - settings.scan_half_extent_m
             poses = sample_road_poses(world, settings.samples_per_area, rng, margin_m=margin)
             if len(poses) < settings.samples_per_area or map_raster.classes is None:

@@ -13,6 +13,7 @@ from learned.map_raster import CLASS_INDEX, MapRaster
 from sequences import paint
 from sequences.osm import Area, Line, MapFeatures, rasterise
 from sequences.world import Material, World, WorldStyle, build_area, sample_road_poses, world_from_raster
+from sequences.world_overhead import drivable_map, overhead_map
 
 GRID = MapGrid(240, 240, 0.5, -60.0, -60.0)
 BARE = WorldStyle(
@@ -223,3 +224,54 @@ def test_strokes_have_their_width(width_m: float, slant: float) -> None:
     paint.stroke(raster, grid, np.array([[5.0, 30.0], [75.0, 30.0 + slant]]), 1, width_m)
     across = np.count_nonzero(raster[:, 200]) * 0.2 * np.cos(np.arctan2(slant, 70.0))
     assert across == pytest.approx(max(width_m, 0.2), abs=0.21)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_from_above_shows_buildings_and_roads_where_the_map_draws_them(seed: int) -> None:
+    world, drawn = build_area(TOWN, GRID, BARE, np.random.default_rng(seed))
+    seen = overhead_map(world, GRID, 0.0, np.random.default_rng(seed))
+    assert drawn.classes is not None
+    assert seen.classes is not None
+    drawn_houses, houses = (raster == CLASS_INDEX["building"] for raster in (drawn.classes, seen.classes))
+    assert np.count_nonzero(drawn_houses & houses) > 0.85 * np.count_nonzero(drawn_houses | houses)
+    middles = [np.argwhere(mask).mean(axis=0) for mask in (drawn_houses, houses)]
+    assert np.abs(middles[0] - middles[1]).max() < 1.0  # walls of this town lie on the borders of pixels
+    roads, carriageways = (raster == CLASS_INDEX["road"] for raster in (drawn.classes, seen.classes))
+    assert np.count_nonzero(roads & carriageways) > 0.95 * np.count_nonzero(roads)
+    lanes_m2 = 0.25 * np.count_nonzero(carriageways)
+    assert lanes_m2 == pytest.approx(120.0 * 13.0 - 42.0 + 900.0, rel=0.1)  # both roads and the car park
+
+
+def test_from_above_crowns_hide_the_road_and_walls_are_too_thin() -> None:
+    leafy = replace(BARE, tree_density=8.0, mapped_share=1.0)
+    world, _ = build_area(TOWN, GRID, leafy, np.random.default_rng(2))
+    seen = overhead_map(world, GRID, 0.0, np.random.default_rng(0)).classes
+    assert seen is not None
+    rows, cols = np.nonzero(seen == CLASS_INDEX["forest"])
+    tops = world.canopy_top[world.cells(GRID.xy_from_pixel(np.column_stack([rows, cols]) + 0.5))]
+    assert len(rows) > 100
+    assert np.mean(tops > 0) > 0.75
+    assert not np.isin(seen, [CLASS_INDEX[name] for name in ("wall", "fence", "hedge", "tree")]).any()
+
+
+def test_from_above_is_decided_by_the_generator_and_shifted_as_asked() -> None:
+    world, _ = build_area(TOWN, GRID, BARE, np.random.default_rng(0))
+    once, again, other = (overhead_map(world, GRID, 0.0, np.random.default_rng(seed)) for seed in (5, 5, 6))
+    assert np.array_equal(once.picture, again.picture)
+    assert not np.array_equal(once.picture, other.picture)
+    middles = []
+    for seed in range(60):
+        classes = overhead_map(world, GRID, 2.0, np.random.default_rng(seed)).classes
+        assert classes is not None
+        middles.append(0.5 * np.argwhere(classes == CLASS_INDEX["building"]).mean(axis=0))
+    spread = np.std(middles, axis=0)  # metres; of 60 draws the estimate is within 1.0 of 2.0 with more than 5 sigma
+    assert (np.abs(spread - 2.0) < 1.0).all()
+
+
+def test_where_one_can_drive_is_all_that_such_a_map_shows() -> None:
+    world, _ = build_area(TOWN, GRID, replace(BARE, poles_per_100m=20.0), np.random.default_rng(0))
+    shown = drivable_map(world, GRID, 0.0, np.random.default_rng(0)).classes
+    assert shown is not None
+    assert set(np.unique(shown)) == {CLASS_INDEX["void"], CLASS_INDEX["road"]}
+    paved_m2 = 0.25 * np.count_nonzero(shown == CLASS_INDEX["road"])
+    assert paved_m2 == pytest.approx(120.0 * 13.0 - 42.0 + 900.0, rel=0.05)  # both roads and the car park, no holes
