@@ -20,7 +20,8 @@ def correlated_error_temperature(distance_m: float, correlation_length_m: float)
     The network sees nearly the same scene `distance_m` later and repeats its error. If errors are a first-order
     autoregression with ``rho = exp(-distance / length)``, then n measurements are worth ``n (1 - rho) / (1 + rho)``
     independent ones, so each likelihood is to be raised to the power 1 / T with ``T = (1 + rho) / (1 - rho)``.
-    The first measurement of a drive has no predecessor and counts in full.
+    The first measurement of a drive has no predecessor and counts in full. This is for filters of small gain, that
+    average over far more than the length; for others it is too cautious, and `error_memory.ErrorMemory` is exact.
 
     Parameters
     ----------
@@ -46,6 +47,20 @@ def correlated_error_temperature(distance_m: float, correlation_length_m: float)
         return 1.0
     half = 0.5 * distance_m / correlation_length_m
     return float(1.0 / max(np.tanh(half), 1.0 / MAX_TEMPERATURE))  # (1 + rho) / (1 - rho) = coth(d / 2L)
+
+
+def error_correlation(distance_m: float, correlation_length_m: float) -> float:
+    """Correlation ``exp(-distance / length)`` of two measurements' errors; 0 for a length of 0.
+
+    Raises
+    ------
+    SkyfixError
+        When an argument is negative or not a number.
+    """
+    for name, value in (("distance_m", distance_m), ("correlation_length_m", correlation_length_m)):
+        if not value >= 0.0:
+            raise SkyfixError(f"{name}: expected >= 0, got {value}")
+    return float(np.exp(-distance_m / correlation_length_m)) if correlation_length_m > 0.0 else 0.0
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:

@@ -44,7 +44,7 @@ from fusion.tracking.tracker_input import (
 from fusion.tracking.tracker_report import Arrival, Outcome, Statistics
 from fusion.tracking.tracker_settings import TrackerSettings, settings_from_tree
 
-_FORMAT, _VERSION = "skyfix tracker", 1
+_FORMAT, _VERSION = "skyfix tracker", 2
 
 
 class Tracker:

@@ -17,9 +17,11 @@ import numpy as np
 
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
-from fusion.consistency import MAX_TEMPERATURE, correlated_error_temperature
+from fusion.consistency import error_correlation
+from fusion.emulation.emulated_likelihood import EmulatedLikelihood
 from fusion.emulation.error_profile import TRANSLOCNET_KITTI, ErrorProfile
 from fusion.emulation.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
+from fusion.error_memory import ErrorMemory
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.odometry import OdometryNoise, increments_at
@@ -84,14 +86,13 @@ class EmulatedRunSettings:
         ):
             raise SkyfixError(f"handled_length_m: expected 0 or more, got {self.handled_length_m}")
 
-    def temperature(self, moved_m: float) -> float:
-        """By how much the filter flattens a likelihood so far after the last one."""
-        rho = self.emulator.step_correlation
+    def correlation(self, moved_m: float) -> float:
+        """What the filter takes for the correlation with the last error, so far after it."""
         if self.handled_length_m is not None:
-            return correlated_error_temperature(moved_m, self.handled_length_m)
-        if rho is not None:
-            return min((1.0 + rho) / (1.0 - rho), MAX_TEMPERATURE)
-        return correlated_error_temperature(moved_m, self.emulator.correlation_length_m)
+            return error_correlation(moved_m, self.handled_length_m)
+        if self.emulator.step_correlation is not None:
+            return self.emulator.step_correlation if np.isfinite(moved_m) else 0.0
+        return error_correlation(moved_m, self.emulator.correlation_length_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,7 +169,7 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
     history = CloudHistory(settings.kept_particles, settings.seed)
     estimates: list[Estimate] = []
     answers: dict[int, FloatArray] = {}
-    since_m = np.inf
+    since_m, memory = np.inf, ErrorMemory()
     for frame, stamp in enumerate(stamps.tolist()):
         if frame:
             increment = increments[frame - 1]
@@ -177,7 +178,7 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
             since_m += float(np.hypot(*increment.delta[:2]))
         if since_m >= settings.measure_every_m:
             likelihood = emulator.measure(poses[frame], since_m)
-            particles.update(likelihood, settings.temperature(since_m) if answers else 1.0)
+            memory = _weigh(particles, likelihood, settings.correlation(since_m), memory)
             answers[frame], since_m = likelihood.answer, 0.0
             history.record(particles, stamp)
         elif frame == len(stamps) - 1:
@@ -200,6 +201,16 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
         "smoother": summarise(poses, smoother.poses, smoother.covariances),
     }
     return EmulatedRun(profile.name, filtered, smoother, single_shot, measured, metrics)
+
+
+def _weigh(
+    particles: ParticleFilter, likelihood: EmulatedLikelihood, correlation: float, memory: ErrorMemory
+) -> ErrorMemory:
+    """Weigh by a measurement, flattened for what it repeats of the last one's error."""
+    before = particles.estimate(0).covariance
+    temperature = memory.temperature(correlation, before)
+    particles.update(likelihood, temperature)
+    return memory.after(correlation, temperature, before, particles.estimate(0).covariance)
 
 
 def _placed(deltas: FloatArray, start: FloatArray) -> FloatArray:

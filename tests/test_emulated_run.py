@@ -58,11 +58,12 @@ def test_settings_reach_the_run() -> None:
     run = run_emulated(truth, emulate_odometry(truth, 1), settings)
     assert len(run.measured) == 60
     assert "OrienterNet" in run.name
-    assert EmulatedRunSettings(emulator=EmulatorSettings(step_correlation=0.9)).temperature(4.0) == pytest.approx(19.0)
+    assert EmulatedRunSettings(emulator=EmulatorSettings(step_correlation=0.9)).correlation(4.0) == 0.9
+    assert EmulatedRunSettings(emulator=EmulatorSettings(step_correlation=0.9)).correlation(np.inf) == 0.0
     long = EmulatorSettings(correlation_length_m=4.0)
-    assert EmulatedRunSettings(emulator=long).temperature(4.0) == pytest.approx((1 + np.exp(-1)) / (1 - np.exp(-1)))
-    assert EmulatedRunSettings(emulator=long, handled_length_m=0.0).temperature(4.0) == 1.0
-    assert EmulatedRunSettings().temperature(4.0) == 1.0
+    assert EmulatedRunSettings(emulator=long).correlation(4.0) == pytest.approx(np.exp(-1))
+    assert EmulatedRunSettings(emulator=long, handled_length_m=0.0).correlation(4.0) == 0.0
+    assert EmulatedRunSettings().correlation(4.0) == 0.0
 
 
 def test_bad_settings_are_refused() -> None:

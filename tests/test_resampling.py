@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.stats import chi2
 
 from fusion import SkyfixError
 from fusion.resampling import RESAMPLERS, effective_sample_size, systematic
@@ -113,3 +114,38 @@ def test_effective_sample_size_of_equal_weights_is_their_number(n, shift):
 def test_effective_sample_size_of_one_heavy_particle_is_one():
     assert effective_sample_size([0.0, -1000.0, -2000.0]) == pytest.approx(1.0)
     assert effective_sample_size(np.log([0.5, 0.25, 0.25])) == pytest.approx(1.0 / (0.25 + 0.0625 + 0.0625))
+
+
+def bias_probability(copies, expected):
+    """p of Hotelling's chi-squared test that copies (runs, N) have their expected mean (N,)."""
+    off = copies - expected
+    covariance = np.cov(off.T)
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > 1e-9 * values[-1]
+    scores = vectors[:, kept].T @ off.mean(axis=0)
+    return chi2.sf(len(copies) * (scores**2 / values[kept]).sum(), kept.sum())
+
+
+@pytest.mark.parametrize("name", sorted(RESAMPLERS))
+def test_no_scheme_is_biased_by_a_chi_squared_test(name):
+    """6,000 runs of 7 from 6; the test finds 0.1 copies moved from one particle to another with power above 0.999."""
+    rng, runs, n = np.random.default_rng(11), 6000, 7
+    weights = np.array([0.05, 0.31, 0.02, 0.22, 0.27, 0.13])
+    copies = np.array([np.bincount(RESAMPLERS[name](weights, n, rng), minlength=6) for _ in range(runs)], dtype=float)
+    assert bias_probability(copies, n * weights) > 1e-3
+    moved = n * weights + 0.1 * np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0])
+    assert bias_probability(copies, moved) < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_stratified_is_filterpy_s_for_the_same_points(seed, monkeypatch):
+    weights = np.random.default_rng(seed).dirichlet(np.ones(50))
+    points = np.random.default_rng(seed + 100).random(50)
+
+    class Fixed:
+        def random(self, n):
+            return points[:n]
+
+    monkeypatch.setattr(filterpy.monte_carlo.resampling, "random", lambda n: points[:n])
+    expected = filterpy.monte_carlo.stratified_resample(weights)
+    np.testing.assert_array_equal(RESAMPLERS["stratified"](weights, 50, Fixed()), expected)

@@ -76,11 +76,17 @@ def test_temperature_comes_from_the_distance_since_the_last_measurement_also_aft
     (first,) = feed(one, [measured[4]])
     assert [m.temperature for m in first.measured] == [1.0]
     (later,) = feed(one, [measured[6]])
-    assert [m.temperature for m in later.measured] == [pytest.approx(correlated_error_temperature(10.1, 6.0), rel=1e-3)]
+    (alone,) = [m.temperature for m in later.measured]
     (between,) = feed(one, [measured[5]])
-    expected = correlated_error_temperature(5.05, 6.0)
     assert [m.stamp_ns for m in between.measured] == [measured[5].stamp_ns, measured[6].stamp_ns]
-    assert [m.temperature for m in between.measured] == [pytest.approx(expected, rel=1e-3)] * 2
+    nearer = [m.temperature for m in between.measured]
+    assert 1.0 < alone < correlated_error_temperature(10.1, 6.0)
+    assert nearer[0] > 1.3 * alone
+    assert nearer[1] != alone
+    in_order = tracker(correlation_length_m=6.0)
+    feed(in_order, odometry)
+    arrivals = feed(in_order, measured[4:7])
+    assert [m.temperature for arrival in arrivals[1:] for m in arrival.measured] == nearer
 
 
 def test_a_kidnapped_vehicle_is_lost_says_so_and_is_found():

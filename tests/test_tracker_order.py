@@ -34,7 +34,8 @@ from fusion import (
     increments_at,
     se2,
 )
-from fusion.consistency import correlated_error_temperature
+from fusion.consistency import error_correlation
+from fusion.error_memory import ErrorMemory
 
 PRIOR = UniformPrior(np.zeros(3), 5.0, 0.3)
 SETTINGS = TrackerSettings(correlation_length_m=4.0)
@@ -129,13 +130,16 @@ def by_hand(messages: list[Message], step_ns: int) -> KalmanFilter:
         s for before, s in zip(path.stamp_ns, path.stamp_ns[1:], strict=False) if s // step_ns != before // step_ns
     ]
     nodes = np.unique([path.stamp_ns[0], *steps, *measured, path.stamp_ns[-1]])
-    kalman, distance = KalmanFilter(np.zeros(3), np.diag([5.0, 5.0, 0.1])), None
+    kalman, distance, memory = KalmanFilter(np.zeros(3), np.diag([5.0, 5.0, 0.1])), None, ErrorMemory()
     for increment in increments_at(nodes, path, OdometryNoise()):
         kalman.predict(increment)
         distance = None if distance is None else distance + np.hypot(*increment.delta[:2])
         if increment.stamp_ns in measured:
-            temperature = 1.0 if distance is None else correlated_error_temperature(distance, 4.0)
+            correlation = 0.0 if distance is None else error_correlation(distance, 4.0)
+            before = kalman.estimate(0).covariance
+            temperature = memory.temperature(correlation, before)
             kalman.update(measured[increment.stamp_ns], temperature)
+            memory = memory.after(correlation, temperature, before, kalman.estimate(0).covariance)
             distance = 0.0
     return kalman
 

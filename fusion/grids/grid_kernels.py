@@ -15,6 +15,7 @@ import numba
 import numpy as np
 
 from fusion.arrays import Float32Array, FloatArray, IntArray
+from fusion.kernels.float_math import get, near, put
 
 DIRECTIONS = 3
 
@@ -74,16 +75,24 @@ def _blur_along(
                 out[c] += taps[n] * (before[c] + after[c])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True)
 def _sum(values: Float32Array, top: int, bottom: int, left: int, right: int) -> float:
     total = 0.0
     for r in range(top, bottom):
-        for c in range(left, right):
-            total += values[r, c]
+        line = values[r, left:right]
+        for c in range(line.size):
+            total += np.float64(line[c])
     return total
 
 
 @numba.njit(cache=True, nogil=True)
+def _window(start: int, count: int, size: int) -> tuple[int, int]:
+    """The part of ``[start, start + count)`` that lies in ``[0, size)``."""
+    first = min(max(start, 0), size)
+    return first, max(min(start + count, size), first)
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
 def translate(
     mass: Float32Array,
     out: Float32Array,
@@ -92,16 +101,16 @@ def translate(
     taps: Float32Array,
     radii: IntArray,
     gain: float,
-    floor: float,
-) -> float:
-    """Blur every plane and move it by whole cells; the mass that leaves the map, times `gain`.
+    rim: int,
+) -> tuple[float, float]:
+    """Blur every plane along lines, move it by whole cells, and multiply it.
 
     Parameters
     ----------
     mass : (K, rows, cols) float32
         Before.
     out : (K, rows + 2 p, cols + 2 p) float32
-        After, inside a frame of p cells of zeros.
+        After, p cells of more room at every edge; of less where p is negative.
     steps : (K, 2) int64
         Rows and columns to move by.
     directions : (K, 3, 2) int64
@@ -110,11 +119,19 @@ def translate(
         Half of a symmetric kernel for each, from its middle outward, R >= 1.
     radii : (K, 3) int64
         Last tap that counts; 0 for no blur.
-    gain, floor : float
-        Multiplies every value; least value inside the map.
+    gain : float
+        Multiplies every value.
+    rim : int
+        How far from its edges a cell of `out` is inside.
+
+    Returns
+    -------
+    tuple of 2 floats
+        All mass, and what of it ends not inside, in the rim or beyond.
     """
     planes, rows, cols = mass.shape
-    frame = (out.shape[1] - rows) // 2
+    height, width = out.shape[1:]
+    frame = (height - rows) // 2
     widest, reach = 0, 0
     for k in range(planes):
         total = 0
@@ -124,10 +141,11 @@ def translate(
             total += step
         reach = max(reach, total)
     pad = reach + widest
-    one = np.zeros((rows + 2 * pad, cols + 2 * pad), dtype=np.float32)
-    other = np.zeros((rows + 2 * pad, cols + 2 * pad), dtype=np.float32)
-    factor, least = np.float32(gain), np.float32(floor)
-    left_map = 0.0
+    tall, wide = rows + 2 * pad, cols + 2 * pad
+    one = np.zeros((tall, wide), dtype=np.float32)
+    other = np.zeros((tall, wide), dtype=np.float32)
+    factor = np.float32(gain)
+    everything = edge = 0.0
     for k in range(planes):
         one[:pad] = 0.0
         one[pad + rows :] = 0.0
@@ -142,112 +160,64 @@ def translate(
             if radii[k, d] > 0:
                 _blur_along(one, other, taps[k, d], radii[k, d], directions[k, d, 0], directions[k, d, 1], widest)
                 one, other = other, one
-        # the window of the blurred plane that lands on the map
-        top = min(max(pad - steps[k, 0], 0), rows + 2 * pad)
-        bottom = max(min(pad - steps[k, 0] + rows, rows + 2 * pad), top)
-        left = min(max(pad - steps[k, 1], 0), cols + 2 * pad)
-        right = max(min(pad - steps[k, 1] + cols, cols + 2 * pad), left)
-        left_map += _sum(one, 0, top, 0, cols + 2 * pad) + _sum(one, bottom, rows + 2 * pad, 0, cols + 2 * pad)
-        left_map += _sum(one, top, bottom, 0, left) + _sum(one, top, bottom, right, cols + 2 * pad)
-        first_row, first_col = top - pad + steps[k, 0], left - pad + steps[k, 1]
-        if right - left < cols or bottom - top < rows:
-            out[k, frame : frame + rows, frame : frame + cols] = least
-        for r in range(bottom - top):
-            values = one[top + r, left:right]
-            line = out[k, frame + first_row + r, frame + first_col : frame + first_col + right - left]
-            for c in range(right - left):
-                line[c] = max(values[c], least)
-    return left_map
+        down, right = steps[k, 0] + frame - pad, steps[k, 1] + frame - pad  # from the padded plane to `out`
+        first, last = _window(-down, height, tall)
+        west, east = _window(-right, width, wide)
+        if east - west < width or last - first < height:
+            out[k] = 0.0
+        for r in range(first, last):
+            values, line = one[r, west:east], out[k, r + down, west + right : east + right]
+            for c in range(values.size):
+                line[c] = values[c]
+        first, last = _window(rim - down, max(height - 2 * rim, 0), tall)
+        west, east = _window(rim - right, max(width - 2 * rim, 0), wide)
+        rest = _sum(one, 0, first, 0, wide) + _sum(one, last, tall, 0, wide)
+        rest += _sum(one, first, last, 0, west) + _sum(one, first, last, east, wide)
+        edge += rest
+        everything += rest + _sum(one, first, last, west, east)
+    return everything, edge
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def mix_headings(
-    framed: Float32Array,
-    out: Float32Array,
-    centre: float,
-    weights: Float32Array,
-    sources: IntArray,
-    cells: IntArray,
-    parts: Float32Array,
-    floor: float,
-) -> None:
-    """Blur across headings: every plane gets shares of its neighbours, moved by parts of a cell.
+def gather(
+    source: Float32Array, width: int, starts: IntArray, weights: Float32Array, out: Float32Array, floor: float
+) -> float:
+    """Weighted sums of cells at fixed distances, for every cell of every plane; the sum of all.
 
     Parameters
     ----------
-    framed : (K, rows + 2 p, cols + 2 p) float32
-        Before, inside a frame of p cells of zeros.
+    source : (...,) float32
+        Planes whose rows are `width` cells long, one behind the other.
+    starts : (K, T) int64
+        Where the cell is that is to be added to cell (0, 0) of the plane; T a multiple of 8.
+    weights : (K, T) float32
+        What each is multiplied by.
     out : (K, rows, cols) float32
-        After.
-    centre : float
-        Share that stays.
-    weights : (M,) float32
-        Share taken from each of the M neighbours.
-    sources : (K, M) int64
-        The neighbours' planes.
-    cells, parts : (K, M, 2) int64, float32
-        Where the mass for cell (0, 0) comes from: the part of cell ``cells + 1``, the rest of cell ``cells``.
-    floor : float
-        Least value.
+        The sums, at least `floor`; none of the same memory as `source`.
     """
     planes, rows, cols = out.shape
-    frame = (framed.shape[1] - rows) // 2
-    stay, least, unit = np.float32(centre), np.float32(floor), np.float32(1.0)
-    for k in range(planes):
-        for r in range(rows):
-            line, own = out[k, r], framed[k, frame + r, frame : frame + cols]
-            for c in range(cols):
-                line[c] = stay * own[c]
-            for m in range(weights.shape[0]):
-                low, right = parts[k, m, 0], parts[k, m, 1]
-                first = frame + cells[k, m, 1]
-                upper = framed[sources[k, m], frame + r + cells[k, m, 0]]
-                lower = framed[sources[k, m], frame + r + cells[k, m, 0] + 1]
-                a, b = upper[first : first + cols], upper[first + 1 : first + 1 + cols]
-                e, f = lower[first : first + cols], lower[first + 1 : first + 1 + cols]
-                wa = weights[m] * (unit - low) * (unit - right)
-                wb = weights[m] * (unit - low) * right
-                we = weights[m] * low * (unit - right)
-                wf = weights[m] * low * right
-                for c in range(cols):
-                    line[c] += wa * a[c] + wb * b[c] + we * e[c] + wf * f[c]
-            for c in range(cols):
-                line[c] = max(line[c], least)
-
-
-@numba.njit(cache=True, nogil=True)
-def mass_mixed_away(
-    framed: Float32Array, frame: int, weights: Float32Array, cells: IntArray, parts: Float32Array
-) -> float:
-    """Mass that :func:`mix_headings` moves beyond the edges.
-
-    Here the tables say where mass goes: from cell (r, c) of plane k to row ``r + cells`` and the next, which gets the
-    part; likewise for columns. Only cells near an edge can lose any.
-    """
-    planes, neighbours = cells.shape[:2]
-    rows, cols = framed.shape[1] - 2 * frame, framed.shape[2] - 2 * frame
+    target, least = out.reshape(-1), np.float32(floor)
     total = 0.0
     for k in range(planes):
-        for m in range(neighbours):
-            for r in range(rows):
-                kept_row = _kept(r + cells[k, m, 0], rows, parts[k, m, 0])
-                inner = min(max(0, -cells[k, m, 1]), cols), max(0, cols - max(0, cells[k, m, 1] + 1))
-                c = 0
-                while c < cols:
-                    if kept_row == 1.0 and inner[0] <= c < inner[1]:
-                        c = inner[1]  # nothing is lost between the two
-                        continue
-                    kept = kept_row * _kept(c + cells[k, m, 1], cols, parts[k, m, 1])
-                    total += weights[m] * (1.0 - kept) * framed[k, frame + r, frame + c]
-                    c += 1
+        for r in range(rows):
+            at, along = (k * rows + r) * cols, r * width
+            for t in range(0, starts.shape[1], 8):
+                a, b, c, d = starts[k, t], starts[k, t + 1], starts[k, t + 2], starts[k, t + 3]
+                e, f, g, h = starts[k, t + 4], starts[k, t + 5], starts[k, t + 6], starts[k, t + 7]
+                wa, wb, wc, wd = weights[k, t], weights[k, t + 1], weights[k, t + 2], weights[k, t + 3]
+                we, wf, wg, wh = weights[k, t + 4], weights[k, t + 5], weights[k, t + 6], weights[k, t + 7]
+                for i in range(cols):
+                    n = along + i
+                    value = wa * near(source, a + n) + wb * near(source, b + n)
+                    value += wc * near(source, c + n) + wd * near(source, d + n)
+                    value += we * near(source, e + n) + wf * near(source, f + n)
+                    value += wg * near(source, g + n) + wh * near(source, h + n)
+                    put(target, at + i, value if t == 0 else get(target, at + i) + value)
+            for i in range(cols):
+                value = max(get(target, at + i), least)
+                put(target, at + i, value)
+                total += np.float64(value)
     return total
-
-
-@numba.njit(cache=True, nogil=True)
-def _kept(cell: int, count: int, part: float) -> float:
-    """Share of what is split between `cell` and the next that lands inside ``[0, count)``."""
-    kept = 1.0 - part if 0 <= cell < count else 0.0
-    return kept + part if -1 <= cell < count - 1 else kept
 
 
 @numba.njit(cache=True, nogil=True)

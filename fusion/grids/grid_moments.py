@@ -12,8 +12,9 @@ import numpy as np
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray
 from fusion.gaussian_mixture import GaussianMixture
-from fusion.grids.grid_kernels import mix_headings, plane_moments
+from fusion.grids.grid_kernels import plane_moments
 from fusion.grids.pose_lattice import PoseLattice
+from fusion.grids.taps import Taps
 from fusion.likelihood import LikelihoodVolume
 from fusion.modes import find_modes
 
@@ -73,10 +74,13 @@ def grid_modes(mass: Float32Array, lattice: PoseLattice, k: int) -> GaussianMixt
     planes = lattice.shape[0]
     framed = np.pad(mass, ((0, 0), (_FRAME, _FRAME), (_FRAME, _FRAME)))
     cells = np.floor(-lattice.offsets)
-    parts = (-lattice.offsets - cells).astype(np.float32)[:, None]
-    own, whole = np.arange(planes)[:, None], np.ones(1, dtype=np.float32)
+    parts = (-lattice.offsets - cells)[:, None]
+    corners = np.indices((2, 2)).reshape(2, -1).T
+    weights = np.where(corners, parts, 1.0 - parts).prod(axis=2).ravel()
+    own = np.repeat(np.arange(planes), len(corners))
+    around = (cells.astype(np.int64)[:, None] + corners).reshape(-1, 2)
     settled = np.empty_like(mass)
-    mix_headings(framed, settled, 0.0, whole, own, cells.astype(np.int64)[:, None], parts, 1e-37)
+    Taps.of(own, own, around, weights, planes).apply(framed, settled, 1e-37)
     scores = np.log(settled.transpose(1, 2, 0))
     modes = find_modes(LikelihoodVolume.from_scores(scores, lattice.grid), k)
     turn = np.array([0.0, 0.0, lattice.turned])

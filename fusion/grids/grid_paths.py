@@ -1,13 +1,13 @@
 """Random cells: from a mass, and backward through a motion, from where mass arrived to where it came from.
 
 A cell that mass arrived in is drawn back along all ways that lead there: the neighbour's plane that a heading error
-brought it from, the split between cells, the blur. Each way has its share in the operator, and its start the mass that
-was there; their product is the chance of having come that way.
+brought it from, the position's error, the blur before. Each way has its share in the operator, and its start the mass
+that was there; their product is the chance of having come that way.
 """
 
 import numpy as np
 
-from fusion.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from fusion.arrays import Float32Array, FloatArray, IntArray
 from fusion.grids.grid_kernels import DIRECTIONS
 from fusion.grids.grid_motion import GridMotion
 
@@ -41,41 +41,37 @@ def draw_sources(mass: Float32Array, motion: GridMotion, cells: IntArray, rng: n
     return sources
 
 
-_Ways = tuple[IntArray, IntArray, IntArray, FloatArray]
+_Ways = tuple[IntArray, IntArray, FloatArray]
 
 
 def _ways_into(motion: GridMotion, plane: int) -> _Ways:
-    """All ways into a plane: source planes (W,), cells between and at the start relative to the end (W, 2), shares."""
-    between = [(plane, np.zeros(2, dtype=np.int64), 1.0)]
-    if motion.mix is not None:
-        sources, cells, parts = motion.mix.gathered()
-        between = [(plane, np.zeros(2, dtype=np.int64), motion.mix.centre)]
-        for m, weight in enumerate(motion.mix.weights):
-            low, right = (float(part) for part in parts[plane, m])
-            for down, across in np.ndindex(2, 2):
-                share = (low if down else 1.0 - low) * (right if across else 1.0 - right)
-                between.append((int(sources[plane, m]), cells[plane, m] + (down, across), float(weight) * share))
-    planes, stops, starts, shares = [], [], [], []
-    for source, stop, share in between:
-        offsets, weights = _blur(motion, source)
+    """All ways into a plane: source planes (W,), cells at the start relative to the end (W, 2), shares (W,)."""
+    taps = motion.gathering
+    planes, starts, shares = [], [], []
+    blurs: dict[int, tuple[IntArray, FloatArray]] = {}
+    for source, stop, share in zip(taps.planes[plane].tolist(), taps.cells[plane], taps.weights[plane], strict=True):
+        if share == 0.0:
+            continue
+        if source not in blurs:
+            blurs[source] = _blur(motion, source)
+        offsets, weights = blurs[source]
         planes.append(np.full(len(weights), source))
-        stops.append(np.broadcast_to(stop, offsets.shape))
         starts.append(stop - motion.steps[source] + offsets)
-        shares.append(share * weights)
-    return np.concatenate(planes), np.concatenate(stops), np.concatenate(starts), np.concatenate(shares)
+        shares.append(np.float64(share) * weights)
+    return np.concatenate(planes), np.concatenate(starts), np.concatenate(shares)
 
 
 def _blur(motion: GridMotion, plane: int) -> tuple[IntArray, FloatArray]:
     """The blur of a plane in one: offsets (B, 2) and weights (B,), the three line blurs multiplied out."""
-    vectors, radii = motion.directions[plane], motion.radii[plane]
+    vectors, taps, radii = (of[plane] for of in motion.noise.lines)
     reach = int((radii[:, None] * np.abs(vectors)).sum(axis=0).max())
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     kernel[reach, reach] = 1.0
     for d in range(DIRECTIONS):
-        blurred = motion.taps[plane, d, 0] * kernel
+        blurred = taps[d, 0] * kernel
         for n in range(1, int(radii[d]) + 1):
             for way in (n, -n):
-                blurred += motion.taps[plane, d, n] * np.roll(kernel, way * vectors[d], axis=(0, 1))
+                blurred += taps[d, n] * np.roll(kernel, way * vectors[d], axis=(0, 1))
         kernel = blurred
     offsets = np.argwhere(kernel > 0.0)
     return offsets - reach, kernel[tuple(offsets.T)]
@@ -83,17 +79,12 @@ def _blur(motion: GridMotion, plane: int) -> tuple[IntArray, FloatArray]:
 
 def _drawn(mass: Float32Array, ways: _Ways, cells: IntArray, where: FloatArray) -> IntArray:
     """One way back for each of the cells (N, 2) of a plane; `where` (N,) uniform in [0, 1)."""
-    planes, stops, starts, shares = ways
-    size = mass.shape[1:]
+    planes, starts, shares = ways
     start = cells[:, None] + starts
-    inside = _on_map(cells[:, None] + stops, size) & _on_map(start, size)
+    inside = np.asarray(((start >= 0) & (start < mass.shape[1:])).all(axis=-1))
     row, col = np.where(inside[..., None], start, 0).transpose(2, 0, 1)
     chances = np.where(inside, mass[planes, row, col] * shares, 0.0)
     cumulative = np.cumsum(chances, axis=1)
     way = (cumulative <= where[:, None] * cumulative[:, -1:]).sum(axis=1)
     every = np.arange(len(cells))
     return np.column_stack([planes[way], start[every, way]])
-
-
-def _on_map(cells: IntArray, size: tuple[int, ...]) -> BoolArray:
-    return np.asarray(((cells >= 0) & (cells < np.array(size))).all(axis=-1))

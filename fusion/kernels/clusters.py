@@ -6,6 +6,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.kernels.float_math import KERNEL, F, sine_cosine
+from fusion.kernels.step import BLOCK, E0, E1, E2, SCRATCH_SIZE, three_normals
+
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
@@ -45,7 +48,12 @@ def components(cells: NDArray[np.int64], size: int, cols: int, yaw_cells: int) -
                 for dcol in range(-1, 2):
                     base = (place + drow * cols + dcol) * yaw_cells
                     for dyaw in range(-1, 2):
-                        near = base + (yaw + dyaw) % yaw_cells
+                        turned = yaw + dyaw
+                        if turned < 0:
+                            turned += yaw_cells
+                        elif turned >= yaw_cells:
+                            turned -= yaw_cells
+                        near = base + turned
                         if label_of[near] == -2:
                             label_of[near] = count
                             waiting[left] = near
@@ -57,24 +65,36 @@ def components(cells: NDArray[np.int64], size: int, cols: int, yaw_cells: int) -
     return labels, count
 
 
+@numba.njit(**KERNEL)
+def _directions(poses: NDArray[np.float64], sines: NDArray[np.float32], cosines: NDArray[np.float32]) -> None:
+    for i in range(len(poses)):
+        sines[i], cosines[i] = sine_cosine(F(poses[i, 2]))
+
+
 @numba.njit(**_OPTIONS)
 def moments_of(
     poses: NDArray[np.float64], weights: NDArray[np.float64], labels: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Mass (M,), mean (M, 3) and covariance (M, 3, 3) of each cluster; one without weight gets equal weights."""
-    mass, scale = np.zeros(count), np.zeros(count)
+    mass, number = np.zeros(count), np.zeros(count)
     for i in range(len(poses)):
         mass[labels[i]] += weights[i]
-    for i in range(len(poses)):
-        scale[labels[i]] += weights[i] if mass[labels[i]] > 0.0 else 1.0
-    sums = np.zeros((count, 4))
+        number[labels[i]] += 1.0
+    sums, per_mass, each = np.zeros((count, 4)), np.zeros(count), np.zeros(count)
+    for m in range(count):
+        if mass[m] > 0.0:
+            per_mass[m] = 1.0 / mass[m]
+        else:
+            each[m] = 1.0 / number[m]
+    sines, cosines = np.empty(len(poses), np.float32), np.empty(len(poses), np.float32)
+    _directions(poses, sines, cosines)
     for i in range(len(poses)):
         m = labels[i]
-        share = (weights[i] if mass[m] > 0.0 else 1.0) / scale[m]
+        share = weights[i] * per_mass[m] + each[m]
         sums[m, 0] += share * poses[i, 0]
         sums[m, 1] += share * poses[i, 1]
-        sums[m, 2] += share * np.cos(poses[i, 2])
-        sums[m, 3] += share * np.sin(poses[i, 2])
+        sums[m, 2] += share * cosines[i]
+        sums[m, 3] += share * sines[i]
     means, covariances = np.empty((count, 3)), np.zeros((count, 3, 3))
     for m in range(count):
         yaw = np.arctan2(sums[m, 3], sums[m, 2])
@@ -82,13 +102,18 @@ def moments_of(
     residual = np.empty(3)
     for i in range(len(poses)):
         m = labels[i]
-        share = (weights[i] if mass[m] > 0.0 else 1.0) / scale[m]
+        share = weights[i] * per_mass[m] + each[m]
         for axis in range(3):
             residual[axis] = poses[i, axis] - means[m, axis]
         residual[2] -= 2.0 * np.pi * np.floor((residual[2] + np.pi) / (2.0 * np.pi))
         for a in range(3):
-            for b in range(3):
-                covariances[m, a, b] += share * residual[a] * residual[b]
+            weighed = share * residual[a]
+            for b in range(a + 1):
+                covariances[m, a, b] += weighed * residual[b]
+    for m in range(count):
+        for a in range(3):
+            for b in range(a):
+                covariances[m, b, a] = covariances[m, a, b]
     return mass, means, covariances
 
 
@@ -99,20 +124,27 @@ def spread_in_clusters(
     means: NDArray[np.float64],
     roots: NDArray[np.float64],
     widths: NDArray[np.float64],
-    noise: NDArray[np.float64],
+    key: NDArray[np.uint32],
 ) -> NDArray[np.float64]:
-    """Poses (N, 3) drawn towards their cluster's mean, with kernel noise of `widths` (M,) times its root (M, 3, 3)."""
-    moved = np.empty_like(poses)
-    for i in range(len(poses)):
-        m = labels[i]
-        h = widths[m]
-        shrink = np.sqrt(1.0 - h * h)
-        for axis in range(3):
-            residual = poses[i, axis] - means[m, axis]
-            if axis == 2:
-                residual -= 2.0 * np.pi * np.floor((residual + np.pi) / (2.0 * np.pi))
-            kick = roots[m, axis, 0] * noise[i, 0] + roots[m, axis, 1] * noise[i, 1] + roots[m, axis, 2] * noise[i, 2]
-            moved[i, axis] = means[m, axis] + shrink * residual + h * kick
-        yaw = moved[i, 2] - 2.0 * np.pi * np.floor((moved[i, 2] + np.pi) / (2.0 * np.pi))
-        moved[i, 2] = yaw if yaw < np.pi else -np.pi
+    """Poses (N, 3) drawn towards their cluster's mean, with kernel noise of `widths` (M,) times its root (M, 3, 3).
+
+    The noise is that of `fusion.kernels.random` with this key (4,), counted by particle.
+    """
+    moved, noise = np.empty_like(poses), np.empty(SCRATCH_SIZE, np.float32)
+    shrink = np.sqrt(1.0 - widths * widths)
+    for start in range(0, len(poses), BLOCK):
+        count = min(BLOCK, len(poses) - start)
+        three_normals(start, count, np.uint32(0), key, noise)
+        for j in range(count):
+            i = start + j
+            m = labels[i]
+            for axis in range(3):
+                residual = poses[i, axis] - means[m, axis]
+                if axis == 2:
+                    residual -= 2.0 * np.pi * np.floor((residual + np.pi) / (2.0 * np.pi))
+                kick = roots[m, axis, 0] * noise[E0 + j] + roots[m, axis, 1] * noise[E1 + j]
+                kick += roots[m, axis, 2] * noise[E2 + j]
+                moved[i, axis] = means[m, axis] + shrink[m] * residual + widths[m] * kick
+            yaw = moved[i, 2] - 2.0 * np.pi * np.floor((moved[i, 2] + np.pi) / (2.0 * np.pi))
+            moved[i, 2] = yaw if yaw < np.pi else -np.pi
     return moved

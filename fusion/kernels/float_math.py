@@ -75,6 +75,17 @@ def take(_context: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
+def near(_context: Any, array: Any, index: Any) -> Any:
+    """As `take`, by an int64: in a loop along neighbours a load of several at once, not a gather."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return _apart(builder, builder.load(builder.gep(data, [arguments[1]], inbounds=True)), "taken")
+
+    return array.dtype(array, types.int64), generate
+
+
+@intrinsic
 def get(_context: Any, scratch: Any, index: Any) -> Any:
     """``scratch[index]``, the index known to be inside it; never of the same memory as what `take` reads."""
 

@@ -62,7 +62,8 @@ Float64s = NDArray[np.float64]
 
 
 @numba.njit(**KERNEL)
-def _three_normals(start: int, n: int, step: np.uint32, key: NDArray[np.uint32], s: Float32s) -> None:
+def three_normals(start: int, n: int, step: np.uint32, key: NDArray[np.uint32], s: Float32s) -> None:
+    """Normals for n particles from `start` on, into E0, E1 and E2 of the scratch `s`."""
     words = (key[0], key[1], key[2], key[3])
     for j in range(n):
         a, b, _, d = threefry((U(start + j), step, U(0), U(0)), words)
@@ -346,7 +347,7 @@ def step_blocks(
                 _six_normals(start, n, epoch, key, s)
                 _regularise(n, motion, s)
             else:
-                _three_normals(start, n, epoch, key, s)
+                three_normals(start, n, epoch, key, s)
             _advance(n, motion, s)
             for axis in range(3):
                 for j in range(n):

@@ -188,8 +188,7 @@ class Cloud:
     def moments(self) -> Moments:
         """Moments of the prediction or of the posterior; resampling, which only adds noise, leaves them as they are."""
         if self._moments is None:
-            self._settle()
-        assert self._moments is not None
+            self._moments = self._pass(None, 0.0)
         return self._moments
 
     def move(self, delta: list[float], covariance: list[list[float]]) -> None:

@@ -45,6 +45,6 @@ def regularised(particles: FloatArray, scale: float, rng: np.random.Generator) -
     count = np.bincount(clusters.labels).astype(np.float64)
     widths = scale * silverman_bandwidth(count, 3)
     roots = matrix_root(clusters.covariances)
-    noise = rng.standard_normal(particles.shape)
+    key = rng.integers(2**32, size=4, dtype=np.uint32)
     particles = np.ascontiguousarray(particles)
-    return spread_in_clusters(particles, clusters.labels, clusters.means, roots, widths, noise)
+    return spread_in_clusters(particles, clusters.labels, clusters.means, roots, widths, key)

@@ -1,9 +1,10 @@
 """Snapshots of a filter along the recent past, from which to go on again when something late arrives."""
 
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
+from fusion.error_memory import ErrorMemory
 from fusion.tracking.archive import Tree
 
 
@@ -19,17 +20,21 @@ class Node:
         The filter's, after moving there and after the measurement there, if any.
     distance_m : float or None
         Driven since the last measurement; None when there has been none.
+    memory : ErrorMemory
+        What measurements so far have in common with the filter's error.
     """
 
     stamp_ns: int
     state: Any
     distance_m: float | None
+    memory: ErrorMemory = field(default_factory=ErrorMemory)
 
     def to_tree(self) -> dict[str, Tree]:
         """Everything, for a file."""
         names = self.state.__dataclass_fields__
         state: dict[str, Tree] = {name: getattr(self.state, name) for name in names}
-        return {"stamp_ns": self.stamp_ns, "distance_m": self.distance_m, "state": state}
+        memory: dict[str, Tree] = {"shared": self.memory.shared, "log_variance": self.memory.log_variance}
+        return {"stamp_ns": self.stamp_ns, "distance_m": self.distance_m, "memory": memory, "state": state}
 
 
 class History:
@@ -88,4 +93,9 @@ class History:
 
 def history_from_tree(tree: Any, state_type: type) -> History:
     """The history that was written, of a filter whose states are of a given type."""
-    return History([Node(entry["stamp_ns"], state_type(**entry["state"]), entry["distance_m"]) for entry in tree])
+    return History(
+        [
+            Node(entry["stamp_ns"], state_type(**entry["state"]), entry["distance_m"], ErrorMemory(**entry["memory"]))
+            for entry in tree
+        ]
+    )

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from fusion.consistency import correlated_error_temperature
+from fusion.consistency import error_correlation
+from fusion.error_memory import ErrorMemory
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.likelihood import PoseLikelihood
@@ -109,7 +110,7 @@ class Timeline:
         self.odometry = OdometryBuffer(self._settings.noise, self._settings.limits, newest)
         self.odometry.kind_counts = entries
         self.likelihoods = LikelihoodBuffer()
-        self.history = History([Node(BEGINNING, self.filter.state(), distance)])
+        self.history = History([Node(BEGINNING, self.filter.state(), distance, head.memory)])
         return waiting
 
     def estimate(self, stamp_ns: int, max_modes: int) -> Estimate:
@@ -180,14 +181,27 @@ class Timeline:
 
     def _node(self, head: Node, stamp_ns: int, progress: Progress) -> Node:
         distance = self._move(head, stamp_ns, stamp_ns)
-        likelihood = self.likelihoods.get(stamp_ns)
+        likelihood, memory = self.likelihoods.get(stamp_ns), head.memory
         if likelihood is not None:
-            length = self._settings.correlation_length_m
-            temperature = 1.0 if distance is None else correlated_error_temperature(distance, length)
-            update = self.filter.update(likelihood, temperature)
-            progress.measured.append(Measured(stamp_ns, temperature, update))
+            measured, memory = self._weigh(stamp_ns, likelihood, distance, memory)
+            progress.measured.append(measured)
             distance = 0.0
-        return Node(stamp_ns, self.filter.state(), distance)
+        return Node(stamp_ns, self.filter.state(), distance, memory)
+
+    def _weigh(
+        self, stamp_ns: int, likelihood: PoseLikelihood, distance: float | None, memory: ErrorMemory
+    ) -> tuple[Measured, ErrorMemory]:
+        """Weigh the filter; errors that this measurement repeats are flattened for."""
+        length = self._settings.correlation_length_m
+        if length == 0.0:
+            return Measured(stamp_ns, 1.0, self.filter.update(likelihood)), memory
+        correlation = 0.0 if distance is None else error_correlation(distance, length)
+        before = self.filter.estimate(stamp_ns).covariance
+        temperature = memory.temperature(correlation, before)
+        update = self.filter.update(likelihood, temperature)
+        if update.used:
+            memory = memory.after(correlation, temperature, before, self.filter.estimate(stamp_ns).covariance)
+        return Measured(stamp_ns, temperature, update), memory
 
     def _move(self, node: Node, stamp_ns: int, key_ns: int, stream: int = _NODE_STREAM) -> float | None:
         """Reseed the filter and move it from a node to a stamp; the distance since the last measurement then."""
