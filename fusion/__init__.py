@@ -15,7 +15,7 @@ from fusion.emulation.likelihood_emulator import EmulatorSettings, LikelihoodEmu
 from fusion.error_correlation import ErrorCorrelation, estimate_error_correlation
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
-from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
+from fusion.factor_graph import AbsoluteFix, LoopClosure, OdometryDrift, SmootherResult, SmootherSettings, smooth
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
@@ -46,6 +46,7 @@ __all__ = [
     "FG2_KITTI_SAME_AREA",
     "ORIENTERNET_KITTI_SEQUENTIAL",
     "TRANSLOCNET_KITTI",
+    "AbsoluteFix",
     "Arrival",
     "CloudHistory",
     "EmulatedLikelihood",
@@ -65,10 +66,12 @@ __all__ = [
     "LikelihoodEmulator",
     "LikelihoodVolume",
     "LocationOrientationMaps",
+    "LoopClosure",
     "MapGrid",
     "Measured",
     "MotionKind",
     "OdometryCalibration",
+    "OdometryDrift",
     "OdometryIncrement",
     "OdometryLimits",
     "OdometryNoise",
