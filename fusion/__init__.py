@@ -18,6 +18,7 @@ from fusion.estimate import Estimate
 from fusion.factor_graph import AbsoluteFix, LoopClosure, OdometryDrift, SmootherResult, SmootherSettings, smooth
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
+from fusion.graph.likelihood_factors import LikelihoodFactors
 from fusion.grid import MapGrid
 from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
@@ -64,6 +65,7 @@ __all__ = [
     "KldSampling",
     "LazyOrientation",
     "LikelihoodEmulator",
+    "LikelihoodFactors",
     "LikelihoodVolume",
     "LocationOrientationMaps",
     "LoopClosure",

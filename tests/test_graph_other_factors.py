@@ -7,6 +7,7 @@ import pytest
 from fusion import (
     AbsoluteFix,
     GaussianMixture,
+    LikelihoodFactors,
     LoopClosure,
     OdometryIncrement,
     SkyfixError,
@@ -115,3 +116,44 @@ def test_bad_factors_are_refused(word, make):
     with pytest.raises(SkyfixError, match=word) as caught:
         smooth(stamps, increments, [None] * 40, prior, start, others=make())
     assert "\n" not in str(caught.value)
+
+
+def test_likelihoods_in_a_graph_of_ones_own_are_the_smoothers():
+    """Rounds of GTSAM's own optimizer with native factors end where `smooth` ends."""
+    stamps, increments, truth, start, prior = circle(12, seed=3)
+    spread, rng = np.diag([0.5, 0.4, 0.05]) ** 2, np.random.default_rng(4)
+    measurements = []
+    for pose in truth:
+        right = pose + rng.multivariate_normal(np.zeros(3), spread)
+        both = np.array([right, right + [6.0, 3.0, 0.0]])
+        measurements.append(GaussianMixture(np.array([0.5, 0.5]), both, np.array([spread, spread])))
+    settings = SmootherSettings(odometry_kernel="none")
+    expected = smooth(stamps, increments, measurements, prior, start, settings).trajectory
+
+    def noise(covariance, yaw):
+        turn = se2.rotation(-yaw)
+        return gtsam.noiseModel.Gaussian.Covariance(turn @ covariance @ turn.T, False)
+
+    mine, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    mine.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*prior.mean), noise(prior.covariance, 0.0)))
+    for node, increment in enumerate(increments):
+        delta = increment.delta
+        mine.add(gtsam.BetweenFactorPose2(node, node + 1, gtsam.Pose2(*delta), noise(STEP, delta[2])))
+    for node, pose in enumerate(start.poses):
+        values.insert(node, gtsam.Pose2(*pose))
+    likelihoods = LikelihoodFactors(range(12), measurements)
+    covariances = [np.diag([3.0, 3.0, 0.2]) ** 2] * 12
+    for _ in range(8):
+        graph = gtsam.NonlinearFactorGraph(mine)
+        for factor in likelihoods.at(values, covariances):
+            graph.push_back(factor)
+        values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        marginals = gtsam.Marginals(graph, values)
+        covariances = [marginals.marginalCovariance(node) for node in range(12)]
+    found = np.array([[pose.x(), pose.y(), pose.theta()] for pose in (values.atPose2(k) for k in range(12))])
+    np.testing.assert_allclose(se2.between(expected.poses, found), 0.0, atol=0.02)
+    for node, covariance in enumerate(covariances):
+        turn = se2.rotation(found[node, 2])
+        np.testing.assert_allclose(turn @ covariance @ turn.T, expected.covariances[node], atol=5e-3)
+    with pytest.raises(SkyfixError, match="one measurement a key"):
+        LikelihoodFactors([0], measurements)
