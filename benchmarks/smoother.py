@@ -1,8 +1,9 @@
-"""Smoothing a drive: skyfix's factor graph (GTSAM) beside scipy on the same factors and from the same start.
+"""Smoothing a drive: skyfix's factor graph beside GTSAM's optimizer and scipy, same factors, same start.
 
-Every node has one Gaussian measurement and none is an outlier, odometry has no robust loss, so that choosing modes ends
-after one round and all implementations minimise the same sum of squares. skyfix gives a covariance for every node on
-top of that; the peers give the poses only. Drive and measurements are drawn by formula from a seed.
+Every node has one Gaussian measurement and none is an outlier, odometry has no robust loss, so that all implementations
+minimise the same sum of squares. skyfix gets them as Gaussians, and once more as whole likelihoods on grids of cells.
+It gives a covariance for every node on top; the peers give the poses only. Drive and measurements are drawn by formula
+from a seed.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse import bsr_array, csr_array
@@ -18,6 +20,7 @@ from scipy.sparse.linalg import spsolve
 from benchmarks.runner import Candidate, Case
 from fusion import (
     GaussianMixture,
+    MapGrid,
     OdometryIncrement,
     OdometryNoise,
     SmootherResult,
@@ -28,9 +31,12 @@ from fusion import (
     smooth,
 )
 from fusion.arrays import FloatArray, IntArray
+from fusion.graph.patch import LikelihoodPatch
+from fusion.likelihood import log_uniform_density
 
 SIZES = (250, 1_000, 2_000)
 SEED = 0
+_FLOOR = -40.0
 SETTINGS = SmootherSettings(outlier_probability=1e-6, odometry_kernel="none")
 _STEP_TOLERANCE = 1e-9  # metres and radians
 _MOST_STEPS = 50
@@ -72,6 +78,42 @@ def example_drive(nodes: int) -> Drive:
 def skyfix_smooth(drive: Drive) -> SmootherResult:
     """skyfix's answer."""
     return smooth(drive.stamps_ns, drive.increments, drive.measurements, drive.prior, drive.start, SETTINGS)
+
+
+def skyfix_whole(drive: Drive, patches: Sequence[LikelihoodPatch]) -> SmootherResult:
+    """skyfix's answer from the measurements as cells of log density."""
+    return smooth(drive.stamps_ns, drive.increments, patches, drive.prior, drive.start, SETTINGS)
+
+
+def whole_likelihoods(drive: Drive) -> list[LikelihoodPatch]:
+    """The Gaussians on grids of 1 m and 1 degree, 10 m and 12 degrees around."""
+    patches = []
+    for mixture in drive.measurements:
+        corner, first = np.floor(mixture.means[0, :2]) - 10.0, round(float(np.rad2deg(mixture.means[0, 2]))) - 12
+        grid = MapGrid(21, 21, 1.0, *corner.tolist())
+        x, y = grid.centres()
+        yaw = np.deg2rad(first + np.arange(25.0))
+        poses = np.stack(np.meshgrid(y, x, yaw, indexing="ij"), axis=-1)[..., [1, 0, 2]]
+        values = np.maximum(mixture.log_density(poses.reshape(-1, 3)), _FLOOR).reshape(poses.shape[:3])
+        patches.append(LikelihoodPatch(values.astype(np.float32), grid, first, 360, _FLOOR, log_uniform_density(grid)))
+    return patches
+
+
+def gtsam_levenberg_marquardt(drive: Drive) -> FloatArray:
+    """Poses (N, 3) by GTSAM's optimizer, every measurement a prior factor."""
+    problem = LeastSquares.of(drive)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noises = [gtsam.noiseModel.Gaussian.SqrtInformation(root, False) for root in problem.root_information]
+    expected = [gtsam.Pose2(x, y, yaw) for x, y, yaw in problem.expected.tolist()]
+    absolute = len(problem.node)
+    for node, pose, noise in zip(problem.node.tolist(), expected[:absolute], noises[:absolute], strict=True):
+        graph.add(gtsam.PriorFactorPose2(node, pose, noise))
+    for node, (motion, noise) in enumerate(zip(expected[absolute:], noises[absolute:], strict=True)):
+        graph.add(gtsam.BetweenFactorPose2(node, node + 1, motion, noise))
+    for node, (x, y, yaw) in enumerate(drive.start.poses.tolist()):
+        values.insert(node, gtsam.Pose2(x, y, yaw))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return np.array(gtsam.utilities.extractPose2(found)).reshape(-1, 3)
 
 
 def scipy_least_squares(drive: Drive) -> FloatArray:
@@ -189,11 +231,14 @@ def cases(sizes: Sequence[int] = SIZES) -> Iterator[Case]:
 
 
 def _case(drive: Drive, size: int) -> Case:
+    patches = whole_likelihoods(drive)
     return Case(
         "chain",
         size,
         (
             Candidate("skyfix smooth (GTSAM), with covariances", lambda: lambda: skyfix_smooth(drive)),
+            Candidate("skyfix smooth, whole likelihoods", lambda: lambda: skyfix_whole(drive, patches)),
+            Candidate("GTSAM Levenberg-Marquardt, poses only", lambda: lambda: gtsam_levenberg_marquardt(drive)),
             Candidate("scipy least_squares, sparse Jacobian, poses only", lambda: lambda: scipy_least_squares(drive)),
             Candidate("scipy Gauss-Newton, sparse LU, poses only", lambda: lambda: scipy_gauss_newton(drive)),
         ),

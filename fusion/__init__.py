@@ -15,9 +15,10 @@ from fusion.emulation.likelihood_emulator import EmulatorSettings, LikelihoodEmu
 from fusion.error_correlation import ErrorCorrelation, estimate_error_correlation
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
-from fusion.factor_graph import SmootherResult, SmootherSettings, smooth
+from fusion.factor_graph import AbsoluteFix, LoopClosure, OdometryDrift, SmootherResult, SmootherSettings, smooth
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
+from fusion.graph.likelihood_factors import LikelihoodFactors
 from fusion.grid import MapGrid
 from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
@@ -46,6 +47,7 @@ __all__ = [
     "FG2_KITTI_SAME_AREA",
     "ORIENTERNET_KITTI_SEQUENTIAL",
     "TRANSLOCNET_KITTI",
+    "AbsoluteFix",
     "Arrival",
     "CloudHistory",
     "EmulatedLikelihood",
@@ -63,12 +65,15 @@ __all__ = [
     "KldSampling",
     "LazyOrientation",
     "LikelihoodEmulator",
+    "LikelihoodFactors",
     "LikelihoodVolume",
     "LocationOrientationMaps",
+    "LoopClosure",
     "MapGrid",
     "Measured",
     "MotionKind",
     "OdometryCalibration",
+    "OdometryDrift",
     "OdometryIncrement",
     "OdometryLimits",
     "OdometryNoise",

@@ -20,6 +20,7 @@ from fusion.graph.chain import Chain
 from fusion.graph.covariances import positive_definite
 from fusion.graph.measurements import NOT_MEASURED, REJECTED, Measurement, Measurements
 from fusion.graph.odometry_drift import OdometryDrift
+from fusion.graph.other_factors import AbsoluteFix, LoopClosure, OtherFactor, bound_nodes, native_factors
 from fusion.graph.pose_graph import PoseGraph, Solution
 from fusion.graph.propagation import Propagated, propagate
 from fusion.graph.sites import Sites
@@ -28,10 +29,21 @@ from fusion.odometry import OdometryIncrement
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory, checked_stamps
 
-__all__ = ["NOT_MEASURED", "REJECTED", "OdometryDrift", "SmootherResult", "SmootherSettings", "smooth"]
+__all__ = [
+    "NOT_MEASURED",
+    "REJECTED",
+    "AbsoluteFix",
+    "LoopClosure",
+    "OdometryDrift",
+    "SmootherResult",
+    "SmootherSettings",
+    "smooth",
+]
 
 _UNKNOWN_START = np.diag([9.0, 9.0, np.deg2rad(10.0) ** 2])  # of start values that come without covariances
 _MOST_LAST_STEPS = 10
+_WIDENINGS = (16.0, 4.0)
+_WIDENED_ROUNDS = 4
 _TOLERANCE = np.array([1e-5, 1e-5, 1e-6])
 
 
@@ -74,6 +86,7 @@ def smooth(
     prior: UniformPrior,
     initial: Trajectory | Sequence[Trajectory],
     settings: SmootherSettings | None = None,
+    others: Sequence[OtherFactor] = (),
 ) -> SmootherResult:
     """Trajectory given all odometry and all measurements.
 
@@ -93,6 +106,8 @@ def smooth(
         with the highest evidence in the end wins.
     settings : SmootherSettings
         How the smoother behaves.
+    others : sequence of LoopClosure or AbsoluteFix
+        Whatever else binds the poses.
 
     Raises
     ------
@@ -113,15 +128,17 @@ def smooth(
         raise SkyfixError("initial: expected at least one trajectory, got none")
     seen = Measurements(measurements, settings.outlier_probability, settings.clutter_log_density)
     chain = Chain.of(increments)
-    kept = np.union1d(seen.nodes, [0, len(stamps) - 1])
-    graph = pose_graph(chain.between(kept), prior, settings)
+    kept = np.union1d(np.union1d(seen.nodes, [0, len(stamps) - 1]), bound_nodes(others, len(stamps)))
+    short, widenings = chain.between(kept), (*(_WIDENINGS if others else ()), 1.0)
+    graphs = [pose_graph(short, prior, settings, native_factors(others, kept, width)) for width in widenings]
     among = seen.renumbered(np.searchsorted(kept, seen.nodes))
     found = max(
-        (_from(start, stamps[kept], graph, among, settings.max_iterations) for start in starts),
+        (_from(start, stamps[kept], graphs, among, settings.max_iterations) for start in starts),
         key=lambda one: one.log_evidence,
     )
     poses = chain.filled(kept, found.solution.poses)
-    whole = graph if len(kept) == len(stamps) else pose_graph(chain, prior, settings)
+    every = np.arange(len(stamps))
+    whole = graphs[-1] if len(kept) == len(every) else pose_graph(chain, prior, settings, native_factors(others, every))
     last = _solved(whole, poses, seen.nodes, found.sites)
     assert last.covariances is not None  # the last step gives them
     assert last.calibration_covariances is not None
@@ -139,10 +156,15 @@ def smooth(
 
 
 def _from(
-    start: Trajectory, stamps: IntArray, graph: PoseGraph, measurements: Measurements, max_rounds: int
+    start: Trajectory, stamps: IntArray, graphs: Sequence[PoseGraph], measurements: Measurements, max_rounds: int
 ) -> Propagated:
+    """From one graph's solution to the next, the last one to convergence."""
     poses, covariances = start.interpolate(stamps), _covariances_near(stamps, start)
-    return propagate(graph, measurements, poses, covariances, max_rounds)
+    for graph in graphs[:-1]:
+        solution = propagate(graph, measurements, poses, covariances, min(max_rounds, _WIDENED_ROUNDS)).solution
+        assert solution.covariances is not None  # every round asks for them
+        poses, covariances = solution.poses, solution.covariances
+    return propagate(graphs[-1], measurements, poses, covariances, max_rounds)
 
 
 def _solved(graph: PoseGraph, poses: FloatArray, nodes: IntArray, sites: Sites) -> Solution:

@@ -23,3 +23,12 @@ def test_online_tracking_stays_near_while_odometry_drifts(capsys: pytest.Capture
     assert sigma < 1.5
     assert lost < 0.1
     assert re.search(r"2001 odometry messages, 40 likelihoods, 40 of them late and replayed", text)
+
+
+def test_a_gtsam_graph_of_ones_own_takes_whole_likelihoods(capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(EXAMPLES / "gtsam_graph.py"), run_name="__main__")
+    found = re.search(r"odometry ([\d.]+) m, map ([\d.]+) m", capsys.readouterr().out)
+    assert found is not None
+    odometry, on_map = (float(value) for value in found.groups())
+    assert on_map < 0.5
+    assert on_map < 0.3 * odometry

@@ -41,7 +41,7 @@ def pose_graph(
         odometry = CalibratedOdometry(chain.deltas, roots, drift.stretches(chain.deltas), width)
         walk = CalibrationWalk(odometry, drift.first_sigmas, drift.step_sigmas)
         return PoseGraph(graph, count, is_chain, walk)
-    noises = noises_of(chain.covariances, chain.deltas[:, 2])
+    noises: list[gtsam.noiseModel.Base] = [*noises_of(chain.covariances, chain.deltas[:, 2])]
     width, kernels = settings.odometry_kernel_width, gtsam.noiseModel.mEstimator
     if settings.odometry_kernel != "none":
         kernel = kernels.Huber.Create(width) if settings.odometry_kernel == "huber" else kernels.DCS.Create(width)

@@ -37,15 +37,15 @@ class Measurements:
     def __init__(
         self, measurements: Sequence[Measurement | None], outlier_probability: float, clutter_log_density: float
     ) -> None:
-        mixtures, patches = {}, {}
+        mixtures: dict[int, GaussianMixture] = {}
+        patches: dict[int, LikelihoodPatch] = {}
         for node, measurement in enumerate(measurements):
             if isinstance(measurement, GaussianLikelihood):
                 measurement = measurement.modes(1)
             if isinstance(measurement, GaussianMixture):
                 mixtures[node] = measurement
             elif measurement is not None:
-                is_patch = isinstance(measurement, LikelihoodPatch)
-                patches[node] = measurement if is_patch else patch_of(measurement)
+                patches[node] = patch_of(measurement)
         self.nodes: IntArray = np.array([*mixtures, *patches], dtype=np.int64)
         self._mixtures = MixtureBank(list(mixtures.values()), outlier_probability, clutter_log_density)
         self._bank = LikelihoodBank(list(patches.values()), outlier_probability)

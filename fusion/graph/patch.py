@@ -84,17 +84,19 @@ class LikelihoodPatch:
         return x, y, self.first_bin * se2.TWO_PI / self.bin_count
 
 
-def patch_of(likelihood: PoseLikelihood, around: Neighbourhood | None = None) -> LikelihoodPatch:
+def patch_of(likelihood: PoseLikelihood | LikelihoodPatch, around: Neighbourhood | None = None) -> LikelihoodPatch:
     """What is to be kept of a likelihood that has been tempered for errors correlated in time.
 
     Parameters
     ----------
     likelihood : PoseLikelihood
         A volume is cut out of; any other is sampled at the pixels of its grid and every degree. An outlier mixture
-        gives the likelihood inside: a smoother has an outlier probability of its own.
+        gives the likelihood inside: a smoother has an outlier probability of its own. A patch stays as it is.
     around : Neighbourhood, optional
         Where the pose may be. Everything that was evaluated is kept when left out.
     """
+    if isinstance(likelihood, LikelihoodPatch):
+        return likelihood
     if isinstance(likelihood, OutlierMixture):
         return patch_of(likelihood.likelihood, around)
     return _patch(likelihood, around)

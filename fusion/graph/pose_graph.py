@@ -95,7 +95,7 @@ class PoseGraph:
         """
         linear = self._linearised(before, nodes, sites)
         try:
-            bayes_net = linear.eliminateSequential(self._order)
+            bayes_net = self._eliminated(linear)
             delta = bayes_net.optimize()
             covariances = self._covariances(linear, bayes_net, before) if marginals else None
         except RuntimeError as error:
@@ -133,6 +133,11 @@ class PoseGraph:
         if self._walk is not None:
             self._walk.add_to(linear, at.poses, at.calibrations)
         return linear
+
+    def _eliminated(self, linear: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesNet:
+        if self._is_chain:
+            return linear.eliminateSequential(self._order)
+        return linear.eliminateSequential()  # loops want another order, GTSAM's own
 
     def _cost(
         self, values: gtsam.Values, poses: FloatArray, calibrations: FloatArray, nodes: IntArray, sites: Sites

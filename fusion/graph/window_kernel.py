@@ -1,7 +1,8 @@
 """Moments of likelihoods under Gaussian windows: all poses in one pass, compiled by numba.
 
-The window ``N(c, W)`` is summed on a lattice of its own, in coordinates in which it is the unit Gaussian: fine enough
-for the window (1.2 standard deviations, where such sums are exact to 1e-6) and for the likelihood's cells.
+A window ``N(c, W)`` that is not much wider than the cells is summed on a lattice of its own, in coordinates in which it
+is the unit Gaussian: fine enough for the window (about one standard deviation, where such sums are exact to 1e-7) and
+for the likelihood's cells. A wide one is summed cell by cell.
 """
 
 import numba
@@ -10,9 +11,69 @@ from numpy.typing import NDArray
 
 from fusion.graph.spline import OPTIONS, value_at
 
-REACH = 3.6  # standard deviations
-_STEP = 1.2
+REACH = 4.2  # standard deviations
+_STEP = 1.05
 _CELL_STEP = 0.8
+_WIDE_CELLS = 1.5  # standard deviations of a window along each axis from which cells are sampled well enough
+
+
+@numba.njit(**OPTIONS)
+def _is_wide(root: NDArray[np.float64], metres: float, radians: float) -> bool:
+    """Whether the window's standard deviations given the other axes are wide against the cells."""
+    least = min(root[0, 0], root[1, 1]) / metres
+    return min(least, root[2, 2] / radians) > _WIDE_CELLS
+
+
+@numba.njit(**OPTIONS)
+def _sum_cells(
+    cells: NDArray[np.float32],
+    first: NDArray[np.float64],
+    metres: float,
+    radians: float,
+    log_uniform: float,
+    outlier: float,
+    centre: NDArray[np.float64],
+    root: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    spread: NDArray[np.float64],
+) -> float:
+    """As `window_moments` for one likelihood, summed over its cells (rows, cols, bins); outliers are added exactly."""
+    rows, cols, bins = cells.shape
+    volume = metres * metres * radians / ((2.0 * np.pi) ** 1.5 * root[0, 0] * root[1, 1] * root[2, 2])
+    total = outlier
+    mean[:] = 0.0
+    spread[:] = 0.0
+    for i in range(3):
+        spread[i, i] = outlier
+    u = np.empty(3)
+    turned = first[2] - centre[2]
+    turned -= 2.0 * np.pi * np.floor((turned + 0.5 * radians * (bins - 1)) / (2.0 * np.pi) + 0.5)
+    for row in range(rows):
+        y = first[1] - metres * row - centre[1]
+        for col in range(cols):
+            u[0] = (first[0] + metres * col - centre[0]) / root[0, 0]
+            u[1] = (y - root[1, 0] * u[0]) / root[1, 1]
+            plan = u[0] * u[0] + u[1] * u[1]
+            if plan > REACH * REACH:
+                continue
+            bend = root[2, 0] * u[0] + root[2, 1] * u[1]
+            for k in range(bins):
+                u[2] = (turned + radians * k - bend) / root[2, 2]
+                square = plan + u[2] * u[2]
+                if square > REACH * REACH:
+                    continue
+                share = (1.0 - outlier) * volume * np.exp(cells[row, col, k] - log_uniform - 0.5 * square)
+                total += share
+                for i in range(3):
+                    mean[i] += share * u[i]
+                    for j in range(3):
+                        spread[i, j] += share * u[i] * u[j]
+    for i in range(3):
+        mean[i] /= total
+    for i in range(3):
+        for j in range(3):
+            spread[i, j] = spread[i, j] / total - mean[i] * mean[j]
+    return float(np.log(total) + log_uniform)
 
 
 @numba.njit(**OPTIONS)
@@ -59,6 +120,21 @@ def window_moments(
     for m in range(len(begins)):
         rows, cols, bins, wraps = shapes[m, 0], shapes[m, 1], shapes[m, 2], shapes[m, 3] == 1
         root, metres, radians = roots[m], cells[m, 0], cells[m, 1]
+        if _is_wide(root, metres, radians):
+            log_mass[m] = _sum_cells(
+                table[begins[m] : begins[m] + rows * cols * bins].reshape(rows, cols, bins),
+                firsts[m],
+                metres,
+                radians,
+                log_uniforms[m],
+                outlier,
+                centres[m],
+                root,
+                means[m],
+                spreads[m],
+            )
+            flat[m] = 1.0
+            continue
         for axis in range(3):
             length = max(abs(root[0, axis]) / metres, abs(root[1, axis]) / metres, abs(root[2, axis]) / radians)
             steps[axis] = min(_STEP, _CELL_STEP / max(length, 1e-9))

@@ -66,6 +66,6 @@ def roots_of(covariances: FloatArray) -> FloatArray:
         When one is not positive definite.
     """
     try:
-        return np.linalg.cholesky(covariances)
+        return np.asarray(np.linalg.cholesky(covariances), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise SkyfixError("windows: expected positive definite covariances, got one that is not") from error
