@@ -166,7 +166,9 @@ class TwoLevelLikelihood:
         if k < 1:
             raise SkyfixError(f"modes: expected k > 0, got {k}")
         poses, masses, within = self._cells_by_mass()
-        weights, means, covariances = [], [], []
+        weights: list[float] = []
+        means: list[FloatArray] = []
+        covariances: list[FloatArray] = []
         free = np.ones(len(poses), np.bool_)
         while free.any() and len(means) < k:
             best = int(np.argmax(np.where(free, masses, -1.0)))
@@ -253,7 +255,8 @@ class TwoLevelLikelihood:
             index, mass = self._fine_index(kept), np.exp(values[kept].astype(np.float64)) * self.fine_volume
         else:
             best = int(np.argmax(self.coarse))
-            index = np.array(np.unravel_index(best, self.coarse.shape))[None] * sides + [sides[0] // 2, sides[0] // 2, 0]
+            corner = np.array(np.unravel_index(best, self.coarse.shape))[None] * sides
+            index = corner + [sides[0] // 2, sides[1] // 2, 0]
             mass = np.exp(self.coarse.reshape(-1)[[best]].astype(np.float64)) * self.cell_volume
             cell = cell * sides
         xy = self.fine_grid.xy_from_pixel(index[:, :2] + 0.5)

@@ -82,7 +82,13 @@ class MapLattice:
 
     @classmethod
     def over(
-        cls, grid: MapGrid, feature_m: float, template: int, yaw_bins: int, multiple_of: int, settings: MapSearchSettings
+        cls,
+        grid: MapGrid,
+        feature_m: float,
+        template: int,
+        yaw_bins: int,
+        multiple_of: int,
+        settings: MapSearchSettings,
     ) -> MapLattice:
         """Lay cells over the map `grid`; the window's sides are multiples of so many features."""
         side = _odd(settings.cell_m / feature_m)
@@ -96,9 +102,7 @@ class MapLattice:
             raise SkyfixError(f"whole-map search: expected a map of {expected}, got {grid.area_m2 * 1e-6:.0f} km^2")
         cell = side * feature_m
         rows, cols = (math.ceil(extent / cell) + 1 for extent in (grid.height_m, grid.width_m))
-        height, width = (
-            multiple_of * math.ceil((padded + side * (count + 1)) / multiple_of) for count in (rows, cols)
-        )
+        height, width = (multiple_of * math.ceil((padded + side * (count + 1)) / multiple_of) for count in (rows, cols))
         # The first coarse cell that is used is the second: its neighbours' fine cells lie in the window as well.
         inset = (padded / 2 + side / 2) * feature_m
         x0 = grid.x0 - inset - 0.5 * (cols * cell - grid.width_m)
@@ -269,7 +273,7 @@ def _log_mean(values: Float32Array) -> Float32Array:
     """ln of the mean exponential of each cell's (M, side, side, turn)."""
     peak = values.max(axis=(1, 2, 3))
     mean = np.exp(values - peak[:, None, None, None]).mean(axis=(1, 2, 3), dtype=np.float64)
-    return (peak + np.log(mean)).astype(np.float32)
+    return np.asarray(peak + np.log(mean), np.float32)
 
 
 def _odd(number: float) -> int:

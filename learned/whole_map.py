@@ -26,9 +26,7 @@ from learned.matcher import MapMatcher
 class WholeMapSearch(Protocol):
     """A matcher's search of one whole map."""
 
-    def match(
-        self, points: NDArray[np.float32], ground_z: float, near: FloatArray | None = None
-    ) -> TwoLevelLikelihood:
+    def match(self, points: NDArray[np.float32], ground_z: float, near: FloatArray | None = None) -> TwoLevelLikelihood:
         """Likelihood of all poses on the map given one scan.
 
         Parameters
@@ -82,9 +80,7 @@ class VotedMapSearch:
     bev: BevSettings
     features: Callable[[NDArray[np.float32]], tuple[Tensor, MapSearch]]
 
-    def match(
-        self, points: NDArray[np.float32], ground_z: float, near: FloatArray | None = None
-    ) -> TwoLevelLikelihood:
+    def match(self, points: NDArray[np.float32], ground_z: float, near: FloatArray | None = None) -> TwoLevelLikelihood:
         """See `WholeMapSearch.match`."""
         scan, search = self.features(bev_counts(points, ground_z, self.bev))
         return search.likelihood(scan, near)

@@ -5,19 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import logsumexp
 
 from fusion.arrays import FloatArray
 from fusion.consistency import correlated_error_temperature
+from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.modes import GaussianMixture
 from fusion.odometry import OdometryIncrement, accumulate
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.prior import UniformPrior
 from learned.matcher import MapMatcher, SearchRegion
+from learned.whole_map import WholeMapSearch, search_over
+from sequences.anywhere import Candidates, GivenUp, map_box
 from sequences.drive import Drive
 from sequences.measurement import Measurement
 from sequences.run_result import FrameRow, Snapshot
@@ -98,6 +101,10 @@ class FilterPass:
         self._rng = np.random.default_rng([settings.seed, _FILTER_STREAM])
         self._start_cloud = StartCloud(prior, settings.particles, settings.outlier_probability, self._rng)
         self._plan = SearchPlan(prior, settings)
+        self._whole_map: WholeMapSearch | None = None
+        self._candidates: Candidates | None = None  # while the whole map is searched, after its first measurement
+        if settings.start_anywhere:
+            self._whole_map = search_over(matcher, drive.sequence.map)
 
     def step(self, frame: int) -> FrameRow:
         """Process one frame; frames come in order from 0.
@@ -110,7 +117,7 @@ class FilterPass:
         watch, reason, evidence = Stopwatch(), "", None
         measurement: Measurement | None
         if self._filter is None:
-            measurement = self._measure(frame, self._plan.region(None), watch)
+            measurement = self._measure(frame, None, watch)
             with watch("update"):
                 self._filter, evidence = self._start(measurement)
         else:
@@ -120,7 +127,7 @@ class FilterPass:
             if measurement is not None:
                 with watch("update"):
                     evidence = self._update(self._filter, frame, measurement)
-        estimate = self._filter.estimate(self._stamp(frame))
+        estimate = self._estimate(self._filter, frame)
         self._keep(frame, estimate, measurement)
         self.rows.append(
             FrameRow(
@@ -139,6 +146,13 @@ class FilterPass:
         )
         return self.rows[-1]
 
+    def _estimate(self, particles: ParticleFilter, frame: int) -> Estimate:
+        """The filter's; among several places on the map it is lost with the chance that it is in another."""
+        estimate = particles.estimate(self._stamp(frame))
+        if self._candidates is None:
+            return estimate
+        return replace(estimate, lost_score=max(estimate.lost_score, 1.0 - self._candidates.share))
+
     def _move(self, particles: ParticleFilter, frame: int) -> None:
         increment = self._increments[frame - 1]
         particles.predict(increment)
@@ -149,7 +163,10 @@ class FilterPass:
     def _due(self) -> bool:
         if self._settings.measure_every_frames is not None:
             return len(self._since_measured) >= self._settings.measure_every_frames
-        return self._travelled_m - self._measured_at_m >= self._settings.measure_every_m
+        every_m = self._settings.measure_every_m
+        if self._plan.phase is Phase.ANYWHERE:
+            every_m = max(every_m, self._settings.whole_map_every_m)
+        return self._travelled_m - self._measured_at_m >= every_m
 
     def _measure_if_due(
         self, particles: ParticleFilter, frame: int, watch: Stopwatch
@@ -158,20 +175,29 @@ class FilterPass:
         if not self._due():
             return None, ""
         prediction = particles.estimate(self._stamp(frame))
-        if not self._drive.sequence.map.grid.contains(prediction.pose[:2]):
+        is_anywhere = self._plan.phase is Phase.ANYWHERE
+        if not (is_anywhere or self._drive.sequence.map.grid.contains(prediction.pose[:2])):
             reason = "the prediction lies outside the map"
         else:
             try:
-                return self._measure(frame, self._plan.region(prediction), watch), ""
+                return self._measure(frame, prediction, watch), ""
             except ScanError as error:
                 reason = str(error)
         self._note(frame, f"not measured: {reason}")
         return None, reason
 
-    def _measure(self, frame: int, search: SearchRegion, watch: Stopwatch) -> Measurement:
+    def _measure(self, frame: int, prediction: Estimate | None, watch: Stopwatch) -> Measurement:
         sequence = self._drive.sequence
         with watch("scan"):
             points = sequence.scan(int(self._drive.indices[frame]))
+        if self._plan.phase is Phase.ANYWHERE and self._whole_map is not None:
+            with watch("match"):
+                near = None if self._filter is None else Candidates.of(self._filter).likely()
+                wide = self._whole_map.match(points, sequence.ground_z, near)
+            box = map_box(sequence.map.grid)
+            everywhere = SearchRegion(box.mean, box.half_extent_m, box.half_heading_rad)
+            return Measurement(points, everywhere, wide, self._temperature())
+        search = self._plan.region(prediction)
         with watch("match"):
             likelihood = self._matcher.match(points, sequence.ground_z, sequence.map, search)
         return Measurement(points, search, likelihood, self._temperature())
@@ -186,24 +212,59 @@ class FilterPass:
         """The filter after the first measurement, and the ln density that it gave to the start's box."""
         in_box = self._prior.sample(self._settings.particles, self._rng)
         density = measurement.likelihood.log_density(in_box)
-        return self._filter_from_start(measurement, None), float(logsumexp(density) - np.log(len(density)))
+        particles = self._filter_from_start(measurement, None)
+        if self._plan.phase is Phase.ANYWHERE:
+            self._candidates = Candidates.of(particles)
+        return particles, float(logsumexp(density) - np.log(len(density)))
 
     def _filter_from_start(self, measurement: Measurement, motion: OdometryIncrement | None) -> ParticleFilter:
         """A filter with the posterior of all measurements since the start."""
         flattened = measurement.likelihood.tempered(measurement.temperature)
-        settings = ParticleFilterSettings(outlier_probability=self._settings.outlier_probability)
         cloud, log_weights = self._start_cloud.add(flattened, motion)
-        return ParticleFilter(cloud, self._rng, settings, log_weights)
+        return ParticleFilter(cloud, self._rng, self._filter_settings(), log_weights)
 
     def _update(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> float:
+        if self._plan.phase is Phase.ANYWHERE:
+            return self._update_anywhere(particles, frame, measurement)
         report = particles.update(measurement.likelihood, measurement.temperature)
         if self._plan.record(measurement.search, report.log_evidence, report.lost_score):
+            self._prepare_whole_map(frame)
             self._note(frame, f"searching for {self._plan.phase.value}")
         if self._plan.phase is Phase.START and len(self._start_cloud) < _START_MEASUREMENTS:
             self._filter = self._filter_from_start(measurement, accumulate(self._since_measured))
         elif report.injected:
             self._note(frame, f"evidence collapsed: {report.injected} particles drawn anew from the measurement")
         return report.log_evidence
+
+    def _prepare_whole_map(self, frame: int) -> None:
+        """Have the map ready when it is to be searched; when the matcher cannot, say so and search about the filter."""
+        if self._plan.phase is Phase.ANYWHERE and self._whole_map is None:
+            try:
+                self._whole_map = search_over(self._matcher, self._drive.sequence.map)
+            except SkyfixError as error:
+                self._plan.without_whole_map()
+                self._note(frame, f"the whole map is not searched: {error}")
+
+    def _update_anywhere(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> float:
+        """Weigh all places on the map by all measurements since it is searched; track the one that wins."""
+        settings, motion = self._settings, accumulate(self._since_measured)
+        if self._candidates is None:  # the first one: begin anew, with what the filter knows as one guess of several
+            given_up = GivenUp.by(particles, self._drive.sequence.map.grid)
+            self._start_cloud = StartCloud(given_up, settings.particles, settings.outlier_probability, self._rng)
+        evidence = particles.update(measurement.likelihood, measurement.temperature).log_evidence
+        if len(self._start_cloud) < _START_MEASUREMENTS:
+            particles = self._filter_from_start(measurement, motion if len(self._start_cloud) else None)
+        self._candidates = Candidates.of(particles)
+        if self._plan.record_places(self._candidates.share):
+            cloud = self._candidates.heaviest_alone(particles, settings.particles, self._rng)
+            particles = ParticleFilter(cloud, self._rng, self._filter_settings())
+            self._candidates = None
+            self._note(frame, f"found at ({cloud[:, 0].mean():.1f}, {cloud[:, 1].mean():.1f})")
+        self._filter = particles
+        return evidence
+
+    def _filter_settings(self) -> ParticleFilterSettings:
+        return ParticleFilterSettings(outlier_probability=self._settings.outlier_probability)
 
     def _keep(self, frame: int, estimate: Estimate, measurement: Measurement | None) -> None:
         self.estimates.append(estimate)
@@ -212,8 +273,8 @@ class FilterPass:
             return
         self.best[frame] = measurement.best_pose()
         self._measured_at_m, self._since_measured = self._travelled_m, []
-        due_at_m = len(self.snapshots) * self._drive.odometry.length_m / self._settings.snapshots
-        if len(self.snapshots) < self._settings.snapshots and self._travelled_m >= due_at_m:
+        kept, wanted = len(self.snapshots), self._settings.snapshots
+        if kept < wanted and self._travelled_m >= kept * self._drive.odometry.length_m / wanted:
             sequence, truth = self._drive.sequence, self._drive.truth
             self.snapshots.append(
                 take_snapshot(

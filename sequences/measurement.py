@@ -10,6 +10,7 @@ from fusion import se2
 from fusion.arrays import Float32Array, FloatArray
 from fusion.likelihood import LikelihoodVolume
 from fusion.modes import GaussianMixture
+from fusion.two_level import TwoLevelLikelihood
 from learned.matcher import SearchRegion
 
 _NEIGHBOURS = np.array([-1, 0, 1])
@@ -26,14 +27,14 @@ class Measurement:
     search
         The poses that were scored.
     likelihood
-        As the matcher gave it.
+        As the matcher gave it: a volume about a prediction, or two levels over a whole map.
     temperature
         By which the filter and the smoother flatten it, for errors shared with the measurement before.
     """
 
     points: Float32Array
     search: SearchRegion
-    likelihood: LikelihoodVolume
+    likelihood: LikelihoodVolume | TwoLevelLikelihood
     temperature: float
 
     def modes(self, k: int) -> GaussianMixture:
@@ -41,8 +42,16 @@ class Measurement:
         return self.likelihood.modes(k).tempered(self.temperature)
 
     def best_pose(self) -> FloatArray:
-        """The matcher's own answer, see `best_pose`."""
+        """The matcher's own answer, see `best_pose`; over a whole map, the mean of the heaviest mode."""
+        if isinstance(self.likelihood, TwoLevelLikelihood):
+            return self.likelihood.modes(1).means[0]
         return best_pose(self.likelihood)
+
+    def heat(self) -> Float32Array:
+        """(rows, cols) ln density, the highest over the headings, on the cells of the likelihood's grid."""
+        whole_map = isinstance(self.likelihood, TwoLevelLikelihood)
+        values = self.likelihood.coarse if whole_map else self.likelihood.log_prob
+        return values.max(axis=2)
 
 
 def best_pose(volume: LikelihoodVolume) -> FloatArray:
