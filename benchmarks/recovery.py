@@ -5,10 +5,10 @@
     python -m benchmarks.recovery outage --sequence drives/kitti_00 --odometry stereo_dso_keyframes
 
 A trial is a random piece of the drive, tracked as `skyfix track` does. kidnap: after 60 to 100 m the drive goes on
-about 200 m away, and the odometry reports nothing of it; asked is an error below 2 m within 100 m. anywhere: nothing is known
-of the start, not even the heading; below 2 m within 300 m. outage: no scan for 300 m of way; below 2 m within 30 m of
-its end, and the truth inside the 95 % ellipse during it. With --out every trial is written when it is done, and a run
-that was stopped goes on. Scans may be simulated from the map; the table says so.
+about 200 m away, and the odometry reports nothing of it; asked is an error below 2 m within 100 m. anywhere: nothing
+is known of the start, not even the heading; below 2 m within 300 m. outage: no scan for 300 m of way; below 2 m
+within 30 m of its end, and the truth inside the 95 % ellipse during it. With --out every trial is written when it is
+done, and a run that was stopped goes on. Scans may be simulated from the map; the table says so.
 """
 
 from __future__ import annotations

@@ -29,6 +29,7 @@ from learned.correlation import MapCorrelator, fast_length, template_spectrum
 from learned.voting import prior_scores, quarter_turn_groups, rotate_templates
 
 _SUB_HEADINGS = 3
+_NEAR_M, _NEAR_RAD = 10.0, math.radians(10.0)
 MOST_CELLS = 100_000_000
 """Of the coarse level: 400 MB."""
 
@@ -167,6 +168,20 @@ class MapSearch:
         gained = _log_mean(fine) - coarse[tuple(cut.T)]
         lifted = coarse + np.float32(np.median(gained))
         return TwoLevelLikelihood.from_scores(lifted, self.lattice.coarse, cut, fine)
+
+    def contrast(self, scan: Tensor, pose: FloatArray) -> float:
+        """Highest coarse score on the map less the highest near a pose (3,): within some 10 m and 12 degrees."""
+        with torch.inference_mode():
+            coarse = self._coarse_scores(scan)
+        grid, bins = self.lattice.coarse, coarse.shape[2]
+        reach = math.ceil(_NEAR_M / grid.metres_per_pixel - 0.5)
+        row, col = (math.floor(at) for at in grid.pixel_from_xy(pose[:2]))
+        turn = round(float(pose[2]) * bins / se2.TWO_PI)
+        half_turn = round(_NEAR_RAD * bins / se2.TWO_PI)
+        yaws = np.arange(turn - half_turn, turn + half_turn + 1) % bins
+        near = coarse[max(row - reach, 0) : max(row + reach + 1, 0), max(col - reach, 0) : max(col + reach + 1, 0)]
+        best_near = near[:, :, yaws].max(initial=coarse.min())
+        return float(coarse.max() - best_near)
 
     def _coarse_scores(self, scan: Tensor) -> Float32Array:
         """(rows, cols, K) on the coarse cells."""

@@ -8,6 +8,8 @@ features may depend on both inputs, but not on the heading, which is unknown unt
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
 from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -264,14 +266,8 @@ class VotingMatcher(Generic[Net]):
         if isinstance(net, SeparateEncoders):
             with torch.inference_mode():
                 kept = search(net.map_features(picture)[0], None)
-            return VotedMapSearch(bev, lambda counts: (net.scan_features(_density(counts))[0], kept))
-
-        def features(counts: NDArray[np.float32]) -> tuple[Tensor, MapSearch]:
-            with torch.inference_mode():
-                scan, found, prior = net.features(_density(counts), picture)
-                return scan[0], search(found[0], None if prior is None else prior[0])
-
-        return VotedMapSearch(bev, features)
+            return VotedMapSearch(bev, partial(_kept_features, net, kept))
+        return VotedMapSearch(bev, partial(_joint_features, net, picture, search))
 
     def images(
         self, counts: NDArray[np.float32], map_raster: MapRaster, search: SearchRegion
@@ -287,3 +283,21 @@ class VotingMatcher(Generic[Net]):
 def _density(counts: NDArray[np.float32]) -> Tensor:
     """Log densities (1, bands, n, n)."""
     return torch.from_numpy(log_density(counts)).float()[None]
+
+
+def _kept_features(net: SeparateEncoders, kept: MapSearch, counts: NDArray[np.float32]) -> tuple[Tensor, MapSearch]:
+    """A scan's features, and the map's as they were."""
+    with torch.inference_mode():
+        return net.scan_features(_density(counts))[0], kept
+
+
+def _joint_features(
+    net: VotingNet,
+    picture: Tensor,
+    search: Callable[[Tensor, Tensor | None], MapSearch],
+    counts: NDArray[np.float32],
+) -> tuple[Tensor, MapSearch]:
+    """A scan's features and the map's, made together."""
+    with torch.inference_mode():
+        scan, found, prior = net.features(_density(counts), picture)
+        return scan[0], search(found[0], None if prior is None else prior[0])

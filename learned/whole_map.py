@@ -38,6 +38,10 @@ class WholeMapSearch(Protocol):
         """
         ...
 
+    def contrast(self, points: NDArray[np.float32], ground_z: float, pose: FloatArray) -> float:
+        """By how many nats the best place on the map fits one scan better than the best near a pose (3,)."""
+        ...
+
 
 @runtime_checkable
 class WholeMapMatcher(Protocol):
@@ -84,3 +88,8 @@ class VotedMapSearch:
         """See `WholeMapSearch.match`."""
         scan, search = self.features(bev_counts(points, ground_z, self.bev))
         return search.likelihood(scan, near)
+
+    def contrast(self, points: NDArray[np.float32], ground_z: float, pose: FloatArray) -> float:
+        """See `WholeMapSearch.contrast`."""
+        scan, search = self.features(bev_counts(points, ground_z, self.bev))
+        return search.contrast(scan, pose)

@@ -22,6 +22,7 @@ from learned.matcher import MapMatcher, SearchRegion
 from learned.whole_map import WholeMapSearch, search_over
 from sequences.anywhere import Candidates, GivenUp, map_box
 from sequences.drive import Drive
+from sequences.map_watch import MapWatch
 from sequences.measurement import Measurement
 from sequences.run_result import FrameRow, Snapshot
 from sequences.search import Phase, SearchPlan
@@ -101,6 +102,7 @@ class FilterPass:
         self._rng = np.random.default_rng([settings.seed, _FILTER_STREAM])
         self._start_cloud = StartCloud(prior, settings.particles, settings.outlier_probability, self._rng)
         self._plan = SearchPlan(prior, settings)
+        self._watch = MapWatch(settings.map_check_every_m, drive.sequence.map.grid.area_m2)
         self._whole_map: WholeMapSearch | None = None
         self._candidates: Candidates | None = None  # while the whole map is searched, after its first measurement
         if settings.start_anywhere:
@@ -149,9 +151,8 @@ class FilterPass:
     def _estimate(self, particles: ParticleFilter, frame: int) -> Estimate:
         """The filter's; among several places on the map it is lost with the chance that it is in another."""
         estimate = particles.estimate(self._stamp(frame))
-        if self._candidates is None:
-            return estimate
-        return replace(estimate, lost_score=max(estimate.lost_score, 1.0 - self._candidates.share))
+        lost = self._watch.lost if self._candidates is None else 1.0 - self._candidates.share
+        return replace(estimate, lost_score=max(estimate.lost_score, lost))
 
     def _move(self, particles: ParticleFilter, frame: int) -> None:
         increment = self._increments[frame - 1]
@@ -228,17 +229,31 @@ class FilterPass:
             return self._update_anywhere(particles, frame, measurement)
         report = particles.update(measurement.likelihood, measurement.temperature)
         if self._plan.record(measurement.search, report.log_evidence, report.lost_score):
-            self._prepare_whole_map(frame)
             self._note(frame, f"searching for {self._plan.phase.value}")
+            if self._plan.phase is Phase.ANYWHERE:
+                self._prepare_whole_map(frame)
         if self._plan.phase is Phase.START and len(self._start_cloud) < _START_MEASUREMENTS:
             self._filter = self._filter_from_start(measurement, accumulate(self._since_measured))
         elif report.injected:
             self._note(frame, f"evidence collapsed: {report.injected} particles drawn anew from the measurement")
+        self._look_around(frame, measurement)
         return report.log_evidence
 
+    def _look_around(self, frame: int, measurement: Measurement) -> None:
+        """Now and then, ask the whole map whether the vehicle is where the filter has it."""
+        if self._plan.phase is not Phase.TRACK or not self._watch.is_due(self._travelled_m):
+            return
+        self._prepare_whole_map(frame)
+        if self._whole_map is None or self._filter is None:
+            return
+        sequence, pose = self._drive.sequence, self._filter.estimate(self._stamp(frame)).pose
+        contrast = self._whole_map.contrast(measurement.points, sequence.ground_z, pose)
+        if self._watch.record(self._travelled_m, contrast) > self._settings.lost_threshold and self._plan.give_up():
+            self._note(frame, f"searching for {self._plan.phase.value}: this scan fits elsewhere")
+
     def _prepare_whole_map(self, frame: int) -> None:
-        """Have the map ready when it is to be searched; when the matcher cannot, say so and search about the filter."""
-        if self._plan.phase is Phase.ANYWHERE and self._whole_map is None:
+        """Have the map ready to be searched; when the matcher cannot, say so once and search about the filter."""
+        if self._whole_map is None and self._plan.has_whole_map:
             try:
                 self._whole_map = search_over(self._matcher, self._drive.sequence.map)
             except SkyfixError as error:
@@ -259,6 +274,7 @@ class FilterPass:
             cloud = self._candidates.heaviest_alone(particles, settings.particles, self._rng)
             particles = ParticleFilter(cloud, self._rng, self._filter_settings())
             self._candidates = None
+            self._watch.restart(self._travelled_m)
             self._note(frame, f"found at ({cloud[:, 0].mean():.1f}, {cloud[:, 1].mean():.1f})")
         self._filter = particles
         return evidence

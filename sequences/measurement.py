@@ -49,9 +49,9 @@ class Measurement:
 
     def heat(self) -> Float32Array:
         """(rows, cols) ln density, the highest over the headings, on the cells of the likelihood's grid."""
-        whole_map = isinstance(self.likelihood, TwoLevelLikelihood)
-        values = self.likelihood.coarse if whole_map else self.likelihood.log_prob
-        return values.max(axis=2)
+        if isinstance(self.likelihood, TwoLevelLikelihood):
+            return self.likelihood.coarse.max(axis=2)
+        return self.likelihood.log_prob.max(axis=2)
 
 
 def best_pose(volume: LikelihoodVolume) -> FloatArray:

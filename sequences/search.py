@@ -56,12 +56,12 @@ class SearchPlan:
         self._lost_half_heading_rad = prior.half_heading_rad
         self._way_m, self._found_at_m = 0.0, -math.inf  # odometry's path; where a wide search last found the vehicle
         self._searched_widely = self._won = 0
-        self._has_whole_map = True
+        self.has_whole_map = True
         self.phase = Phase.ANYWHERE if settings.start_anywhere else Phase.START
 
     def without_whole_map(self) -> None:
         """Never look for the vehicle on the whole map: the matcher cannot."""
-        self._has_whole_map = False
+        self.has_whole_map = False
         if self.phase is Phase.ANYWHERE:
             self.phase, self._searched_widely = Phase.LOST, 0
 
@@ -115,13 +115,20 @@ class SearchPlan:
             self._track()
         elif self.phase is Phase.TRACK and self._disagreeing >= self._settings.patience:
             has_relapsed = self._way_m - self._found_at_m < self._settings.relapse_m
-            self.phase = Phase.ANYWHERE if has_relapsed and self._has_whole_map else Phase.LOST
+            self.phase = Phase.ANYWHERE if has_relapsed and self.has_whole_map else Phase.LOST
             self._searched_widely = 0
-        elif before is Phase.LOST and self._searched_widely >= self._settings.lost_patience and self._has_whole_map:
+        elif before is Phase.LOST and self._searched_widely >= self._settings.lost_patience and self.has_whole_map:
             self.phase = Phase.ANYWHERE
         if self.phase is Phase.ANYWHERE:
             self._won = 0
         return self.phase is not before
+
+    def give_up(self) -> bool:
+        """Look for the vehicle on the whole map: it is not where the filter is. True when that changes the phase."""
+        if self.phase not in (Phase.TRACK, Phase.LOST) or not self.has_whole_map:
+            return False
+        self.phase, self._won = Phase.ANYWHERE, 0
+        return True
 
     def record_places(self, share: float) -> bool:
         """Note the likeliest place's share of the posterior after a search of the whole map; True when it has won."""

@@ -57,6 +57,9 @@ class TrackSettings:
     lost_threshold, patience
         A measurement agrees with the filter when it fits its prediction and leaves its lost score below the threshold.
         The search narrows after so many in a row that do, and widens after so many that do not.
+    map_check_every_m
+        While the vehicle is tracked, a scan is compared with the whole map every so many metres (see `map_watch`),
+        where the matcher can; 0 for never. It decides on nothing but whether the vehicle is lost.
     lost_patience
         A vehicle that so many wide searches have not found again is looked for on the whole map.
     relapse_m
@@ -93,6 +96,7 @@ class TrackSettings:
     modes: int = 5
     lost_threshold: float = 0.5
     patience: int = 3
+    map_check_every_m: float = 8.0
     lost_patience: int = 3
     relapse_m: float = 50.0
     whole_map_every_m: float = 8.0
@@ -129,6 +133,7 @@ class TrackSettings:
             "search_start_growth_m",
             "map_error_m",
             "correlation_length_m",
+            "map_check_every_m",
             "relapse_m",
             "whole_map_every_m",
             "snapshots",
