@@ -256,7 +256,7 @@ class MapSearch:
         if self._prior is not None:
             box = self._prior[rows.start : rows.stop, :, cols.start : cols.stop, :]
             scores = scores + box.reshape(side * len(rows), side * len(cols))[:, :, None]
-        return scores / np.float32(self._temperature)
+        return np.asarray(scores / np.float32(self._temperature), np.float32)
 
     def _prior_of_cells(self, prior: Tensor) -> Float32Array:
         """(rows, side, cols, side): the prior at the positions of the fine cells."""

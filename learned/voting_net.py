@@ -250,13 +250,14 @@ class VotingMatcher(Generic[Net]):
         return self._over_map[1]
 
     def _search_of(self, map_raster: MapRaster) -> WholeMapSearch | None:
-        net, bev = self.net, self.net.settings.bev
+        net: object = self.net
         if not isinstance(net, SeparateEncoders | VotingNet):
             return None
-        feature_m, settings = bev.metres_per_pixel * net.stride, MapSearchSettings()
-        template, multiple = bev.size // net.stride, CROP_MULTIPLE // net.stride
+        bev, stride = self.net.settings.bev, self.net.stride
+        feature_m, settings = bev.metres_per_pixel * stride, MapSearchSettings()
+        template, multiple = bev.size // stride, CROP_MULTIPLE // stride
         lattice = MapLattice.over(map_raster.grid, feature_m, template, self.yaw_bins, multiple, settings)
-        rows, cols = lattice.window.rows * net.stride, lattice.window.cols * net.stride
+        rows, cols = lattice.window.rows * stride, lattice.window.cols * stride
         pixels = MapGrid(rows, cols, bev.metres_per_pixel, lattice.window.x0, lattice.window.y0)
         picture = picture_tensor(map_raster.resampled(pixels).picture)[None]
 

@@ -7,15 +7,16 @@ was given up wrongly is not thrown away, it is one candidate among the others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fusion import se2
 from fusion.arrays import FloatArray
+from fusion.estimate import Estimate
 from fusion.grid import MapGrid
 from fusion.particle_filter import ParticleFilter
-from fusion.particles.clusters import Clusters, find_clusters
+from fusion.particles.clusters import VARIANCE_FLOOR, Clusters, find_clusters
 from fusion.particles.lattice_density import LatticeDensity
 from fusion.particles.regularisation import regularised
 from fusion.prior import UniformPrior
@@ -95,6 +96,16 @@ class Candidates:
         means = self.clusters.means[heaviest]
         means[:, 2] = se2.wrap(means[:, 2])
         return means
+
+    def likeliest(self, estimate: Estimate) -> Estimate:
+        """An estimate of the whole cloud, made one of its heaviest place; the others' share is the chance of error."""
+        heaviest = int(np.argmax(self.clusters.weights))
+        return replace(
+            estimate,
+            pose=self.clusters.means[heaviest],
+            covariance=self.clusters.covariances[heaviest] + VARIANCE_FLOOR,
+            lost_score=max(estimate.lost_score, 1.0 - self.share),
+        )
 
     def heaviest_alone(self, particles: ParticleFilter, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw particles (count, 3) from the heaviest place."""

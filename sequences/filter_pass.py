@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from fusion.arrays import FloatArray
+from fusion.arrays import Float32Array, FloatArray
 from fusion.consistency import correlated_error_temperature
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
@@ -149,10 +149,11 @@ class FilterPass:
         return self.rows[-1]
 
     def _estimate(self, particles: ParticleFilter, frame: int) -> Estimate:
-        """The filter's; among several places on the map it is lost with the chance that it is in another."""
+        """The filter's; while the whole map is searched that of the likeliest place, lost with the others' share."""
         estimate = particles.estimate(self._stamp(frame))
-        lost = self._watch.lost if self._candidates is None else 1.0 - self._candidates.share
-        return replace(estimate, lost_score=max(estimate.lost_score, lost))
+        if self._candidates is not None:
+            return Candidates.of(particles).likeliest(estimate)
+        return replace(estimate, lost_score=max(estimate.lost_score, self._watch.lost))
 
     def _move(self, particles: ParticleFilter, frame: int) -> None:
         increment = self._increments[frame - 1]
@@ -193,15 +194,20 @@ class FilterPass:
             points = sequence.scan(int(self._drive.indices[frame]))
         if self._plan.phase is Phase.ANYWHERE and self._whole_map is not None:
             with watch("match"):
-                near = None if self._filter is None else Candidates.of(self._filter).likely()
-                wide = self._whole_map.match(points, sequence.ground_z, near)
-            box = map_box(sequence.map.grid)
-            everywhere = SearchRegion(box.mean, box.half_extent_m, box.half_heading_rad)
-            return Measurement(points, everywhere, wide, self._temperature())
+                return self._measure_anywhere(self._whole_map, points)
         search = self._plan.region(prediction)
         with watch("match"):
             likelihood = self._matcher.match(points, sequence.ground_z, sequence.map, search)
         return Measurement(points, search, likelihood, self._temperature())
+
+    def _measure_anywhere(self, whole_map: WholeMapSearch, points: Float32Array) -> Measurement:
+        sequence = self._drive.sequence
+        near = None if self._filter is None else Candidates.of(self._filter).likely()
+        likelihood = whole_map.match(points, sequence.ground_z, near)
+        box = map_box(sequence.map.grid)
+        everywhere = SearchRegion(box.mean, box.half_extent_m, box.half_heading_rad)
+        # The first of a search begins anew, and shares its errors with nothing that counts.
+        return Measurement(points, everywhere, likelihood, 1.0 if self._candidates is None else self._temperature())
 
     def _temperature(self) -> float:
         """1 for the first measurement of a drive, more when little way lies between two of them."""
@@ -230,7 +236,7 @@ class FilterPass:
         report = particles.update(measurement.likelihood, measurement.temperature)
         if self._plan.record(measurement.search, report.log_evidence, report.lost_score):
             self._note(frame, f"searching for {self._plan.phase.value}")
-            if self._plan.phase is Phase.ANYWHERE:
+            if not self._plan.follows_filter:
                 self._prepare_whole_map(frame)
         if self._plan.phase is Phase.START and len(self._start_cloud) < _START_MEASUREMENTS:
             self._filter = self._filter_from_start(measurement, accumulate(self._since_measured))
@@ -241,7 +247,8 @@ class FilterPass:
 
     def _look_around(self, frame: int, measurement: Measurement) -> None:
         """Now and then, ask the whole map whether the vehicle is where the filter has it."""
-        if self._plan.phase is not Phase.TRACK or not self._watch.is_due(self._travelled_m):
+        is_due = self._plan.phase is Phase.LOST or self._watch.is_due(self._travelled_m)
+        if not (self._plan.follows_filter and is_due):
             return
         self._prepare_whole_map(frame)
         if self._whole_map is None or self._filter is None:
@@ -250,6 +257,7 @@ class FilterPass:
         contrast = self._whole_map.contrast(measurement.points, sequence.ground_z, pose)
         if self._watch.record(self._travelled_m, contrast) > self._settings.lost_threshold and self._plan.give_up():
             self._note(frame, f"searching for {self._plan.phase.value}: this scan fits elsewhere")
+            self._update_anywhere(self._filter, frame, self._measure_anywhere(self._whole_map, measurement.points))
 
     def _prepare_whole_map(self, frame: int) -> None:
         """Have the map ready to be searched; when the matcher cannot, say so once and search about the filter."""

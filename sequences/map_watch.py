@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from fusion.particles.lost import LostModel, probability
 
-_BY_CHANCE_NATS = 4.0
+_BY_CHANCE_NATS = 3.0
+_SUSPICION = 0.01
 _LEAST_AREA_M2 = 1e6
 
 
@@ -25,7 +26,7 @@ class MapWatch:
     ----------
     every_m
         A scan is compared with the whole map every so many metres, 0 for never; more rarely on maps above 1 km^2, in
-        proportion.
+        proportion. Every scan is, as soon as one gave rise to suspicion.
     area_m2
         Of the map.
     """
@@ -38,7 +39,8 @@ class MapWatch:
 
     def is_due(self, way_m: float) -> bool:
         """Whether to compare at this metre of the drive."""
-        return self._every_m > 0.0 and way_m - self._asked_at_m >= self._every_m
+        is_suspicious = self.lost > _SUSPICION
+        return self._every_m > 0.0 and (is_suspicious or way_m - self._asked_at_m >= self._every_m)
 
     def record(self, way_m: float, contrast_nats: float) -> float:
         """Take in a comparison; the probability of being elsewhere after it."""

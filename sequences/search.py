@@ -123,9 +123,14 @@ class SearchPlan:
             self._won = 0
         return self.phase is not before
 
+    @property
+    def follows_filter(self) -> bool:
+        """Whether searches are about the filter's prediction."""
+        return self.phase in (Phase.TRACK, Phase.LOST)
+
     def give_up(self) -> bool:
         """Look for the vehicle on the whole map: it is not where the filter is. True when that changes the phase."""
-        if self.phase not in (Phase.TRACK, Phase.LOST) or not self.has_whole_map:
+        if not (self.follows_filter and self.has_whole_map):
             return False
         self.phase, self._won = Phase.ANYWHERE, 0
         return True

@@ -100,7 +100,7 @@ class TrackSettings:
     lost_patience: int = 3
     relapse_m: float = 50.0
     whole_map_every_m: float = 8.0
-    winner_share: float = 0.95
+    winner_share: float = 0.9
     snapshots: int = 6
     noise: OdometryNoise = field(default_factory=OdometryNoise)
 
