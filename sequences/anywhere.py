@@ -1,8 +1,7 @@
-"""Looking for the vehicle on the whole map: the posterior of all measurements since it was given up, until one wins.
+"""A vehicle that may be anywhere on the map: what is known of it beforehand, and the places where it may be.
 
-As at a start, the cloud is made anew with each measurement from all of them (`start_cloud`). What is known beforehand
-is a mixture: with the probability of being lost, anywhere on the map; else where the filter has it. So a vehicle that
-was given up wrongly is not thrown away, it is one candidate among the others.
+What is known of a vehicle that was given up is a mixture: with the probability of being lost it is anywhere on the map,
+else where the filter has it. So one that was given up wrongly is not thrown away, it is one candidate among the others.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from fusion.arrays import Float32Array, FloatArray
+from fusion.arrays import FloatArray
 from fusion.consistency import correlated_error_temperature
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
@@ -18,9 +18,9 @@ from fusion.modes import GaussianMixture
 from fusion.odometry import OdometryIncrement, accumulate
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.prior import UniformPrior
-from learned.matcher import MapMatcher, SearchRegion
-from learned.whole_map import WholeMapSearch, search_over
-from sequences.anywhere import Candidates, GivenUp, map_box
+from fusion.two_level import TwoLevelLikelihood
+from learned.matcher import MapMatcher
+from sequences.anywhere_search import AnywhereSearch
 from sequences.drive import Drive
 from sequences.map_watch import MapWatch
 from sequences.measurement import Measurement
@@ -28,13 +28,12 @@ from sequences.run_result import FrameRow, Snapshot
 from sequences.search import Phase, SearchPlan
 from sequences.sequence import ScanError
 from sequences.snapshots import take_snapshot
-from sequences.start_cloud import StartCloud
+from sequences.start_cloud import MOST_MEASUREMENTS, StartCloud
 from sequences.track_settings import TrackSettings
 from sequences.trajectory_io import format_seconds
 
 STAGES = ("scan", "match", "predict", "update")
 _FILTER_STREAM = 1
-_START_MEASUREMENTS = 8  # volumes kept in memory at most
 
 
 @dataclass(slots=True)
@@ -50,7 +49,8 @@ class Stopwatch:
         try:
             yield
         finally:
-            self.milliseconds[stage] = 1e3 * (time.perf_counter() - begin)
+            taken = 1e3 * (time.perf_counter() - begin)
+            self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + taken
 
 
 class FilterPass:
@@ -103,10 +103,9 @@ class FilterPass:
         self._start_cloud = StartCloud(prior, settings.particles, settings.outlier_probability, self._rng)
         self._plan = SearchPlan(prior, settings)
         self._watch = MapWatch(settings.map_check_every_m, drive.sequence.map.grid.area_m2)
-        self._whole_map: WholeMapSearch | None = None
-        self._candidates: Candidates | None = None  # while the whole map is searched, after its first measurement
+        self._anywhere = AnywhereSearch(matcher, drive.sequence.map, drive.sequence.ground_z, settings, self._rng)
         if settings.start_anywhere:
-            self._whole_map = search_over(matcher, drive.sequence.map)
+            self._anywhere.prepare()
 
     def step(self, frame: int) -> FrameRow:
         """Process one frame; frames come in order from 0.
@@ -129,6 +128,8 @@ class FilterPass:
             if measurement is not None:
                 with watch("update"):
                     evidence = self._update(self._filter, frame, measurement)
+                with watch("match"):
+                    self._look_around(self._filter, frame, measurement)
         estimate = self._estimate(self._filter, frame)
         self._keep(frame, estimate, measurement)
         self.rows.append(
@@ -149,10 +150,10 @@ class FilterPass:
         return self.rows[-1]
 
     def _estimate(self, particles: ParticleFilter, frame: int) -> Estimate:
-        """The filter's; while the whole map is searched that of the likeliest place, lost with the others' share."""
+        """The filter's, or that of the likeliest place on the map; as lost as the whole map says, if that is more."""
+        if self._anywhere.is_running:
+            return self._anywhere.estimate(particles, self._stamp(frame))
         estimate = particles.estimate(self._stamp(frame))
-        if self._candidates is not None:
-            return Candidates.of(particles).likeliest(estimate)
         return replace(estimate, lost_score=max(estimate.lost_score, self._watch.lost))
 
     def _move(self, particles: ParticleFilter, frame: int) -> None:
@@ -192,26 +193,19 @@ class FilterPass:
         sequence = self._drive.sequence
         with watch("scan"):
             points = sequence.scan(int(self._drive.indices[frame]))
-        if self._plan.phase is Phase.ANYWHERE and self._whole_map is not None:
+        if self._plan.phase is Phase.ANYWHERE:
             with watch("match"):
-                return self._measure_anywhere(self._whole_map, points)
+                everywhere = self._anywhere.match(points, self._filter)
+            return Measurement(points, self._anywhere.region(), everywhere, self._temperature())
         search = self._plan.region(prediction)
         with watch("match"):
             likelihood = self._matcher.match(points, sequence.ground_z, sequence.map, search)
         return Measurement(points, search, likelihood, self._temperature())
 
-    def _measure_anywhere(self, whole_map: WholeMapSearch, points: Float32Array) -> Measurement:
-        sequence = self._drive.sequence
-        near = None if self._filter is None else Candidates.of(self._filter).likely()
-        likelihood = whole_map.match(points, sequence.ground_z, near)
-        box = map_box(sequence.map.grid)
-        everywhere = SearchRegion(box.mean, box.half_extent_m, box.half_heading_rad)
-        # The first of a search begins anew, and shares its errors with nothing that counts.
-        return Measurement(points, everywhere, likelihood, 1.0 if self._candidates is None else self._temperature())
-
     def _temperature(self) -> float:
-        """1 for the first measurement of a drive, more when little way lies between two of them."""
-        if self._filter is None or self._correlation_m == 0.0:
+        """1 for the first measurement of a drive or a search, more when little way lies between two of them."""
+        is_first = self._filter is None or (self._plan.phase is Phase.ANYWHERE and not self._anywhere.is_running)
+        if is_first or self._correlation_m == 0.0:
             return 1.0
         return correlated_error_temperature(self._travelled_m - self._measured_at_m, self._correlation_m)
 
@@ -219,76 +213,64 @@ class FilterPass:
         """The filter after the first measurement, and the ln density that it gave to the start's box."""
         in_box = self._prior.sample(self._settings.particles, self._rng)
         density = measurement.likelihood.log_density(in_box)
-        particles = self._filter_from_start(measurement, None)
-        if self._plan.phase is Phase.ANYWHERE:
-            self._candidates = Candidates.of(particles)
-        return particles, float(logsumexp(density) - np.log(len(density)))
+        evidence = float(logsumexp(density) - np.log(len(density)))
+        if isinstance(measurement.likelihood, TwoLevelLikelihood):
+            return self._anywhere.update(None, measurement.likelihood, measurement.temperature, None), evidence
+        return self._filter_from_start(measurement, None), evidence
 
     def _filter_from_start(self, measurement: Measurement, motion: OdometryIncrement | None) -> ParticleFilter:
         """A filter with the posterior of all measurements since the start."""
         flattened = measurement.likelihood.tempered(measurement.temperature)
+        settings = ParticleFilterSettings(outlier_probability=self._settings.outlier_probability)
         cloud, log_weights = self._start_cloud.add(flattened, motion)
-        return ParticleFilter(cloud, self._rng, self._filter_settings(), log_weights)
+        return ParticleFilter(cloud, self._rng, settings, log_weights)
 
     def _update(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> float:
-        if self._plan.phase is Phase.ANYWHERE:
-            return self._update_anywhere(particles, frame, measurement)
         report = particles.update(measurement.likelihood, measurement.temperature)
+        if isinstance(measurement.likelihood, TwoLevelLikelihood):
+            self._update_anywhere(particles, frame, measurement.likelihood, measurement.temperature)
+            return report.log_evidence
         if self._plan.record(measurement.search, report.log_evidence, report.lost_score):
             self._note(frame, f"searching for {self._plan.phase.value}")
-            if not self._plan.follows_filter:
-                self._prepare_whole_map(frame)
-        if self._plan.phase is Phase.START and len(self._start_cloud) < _START_MEASUREMENTS:
+            self._prepare_whole_map(frame)
+        if self._plan.phase is Phase.START and len(self._start_cloud) < MOST_MEASUREMENTS:
             self._filter = self._filter_from_start(measurement, accumulate(self._since_measured))
         elif report.injected:
             self._note(frame, f"evidence collapsed: {report.injected} particles drawn anew from the measurement")
-        self._look_around(frame, measurement)
         return report.log_evidence
 
-    def _look_around(self, frame: int, measurement: Measurement) -> None:
-        """Now and then, ask the whole map whether the vehicle is where the filter has it."""
-        is_due = self._plan.phase is Phase.LOST or self._watch.is_due(self._travelled_m)
-        if not (self._plan.follows_filter and is_due):
-            return
-        self._prepare_whole_map(frame)
-        if self._whole_map is None or self._filter is None:
-            return
-        sequence, pose = self._drive.sequence, self._filter.estimate(self._stamp(frame)).pose
-        contrast = self._whole_map.contrast(measurement.points, sequence.ground_z, pose)
-        if self._watch.record(self._travelled_m, contrast) > self._settings.lost_threshold and self._plan.give_up():
-            self._note(frame, f"searching for {self._plan.phase.value}: this scan fits elsewhere")
-            self._update_anywhere(self._filter, frame, self._measure_anywhere(self._whole_map, measurement.points))
+    def _update_anywhere(
+        self, particles: ParticleFilter, frame: int, likelihood: TwoLevelLikelihood, temperature: float
+    ) -> None:
+        """Weigh all places on the map; track the one that wins."""
+        particles = self._anywhere.update(particles, likelihood, temperature, accumulate(self._since_measured))
+        if self._plan.record_places(self._anywhere.share(particles)):
+            particles = self._anywhere.settle(particles)
+            self._watch.restart(self._travelled_m)
+            x, y, _ = particles.estimate(self._stamp(frame)).pose
+            self._note(frame, f"found at ({x:.1f}, {y:.1f})")
+        self._filter = particles
 
-    def _prepare_whole_map(self, frame: int) -> None:
+    def _look_around(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> None:
+        """Now and then, ask the whole map whether the vehicle is where the filter has it; if not, search all of it."""
+        is_due = self._plan.phase is Phase.LOST or self._watch.is_due(self._travelled_m)
+        if not (is_due and self._plan.follows_filter and self._prepare_whole_map(frame)):
+            return
+        contrast = self._anywhere.contrast(measurement.points, particles.estimate(self._stamp(frame)).pose)
+        if self._watch.record(self._travelled_m, contrast) > self._settings.lost_threshold:
+            self._plan.give_up()
+            self._note(frame, f"searching for {self._plan.phase.value}: this scan fits elsewhere")
+            self._update_anywhere(particles, frame, self._anywhere.match(measurement.points, particles), 1.0)
+
+    def _prepare_whole_map(self, frame: int) -> bool:
         """Have the map ready to be searched; when the matcher cannot, say so once and search about the filter."""
-        if self._whole_map is None and self._plan.has_whole_map:
+        if self._plan.has_whole_map:
             try:
-                self._whole_map = search_over(self._matcher, self._drive.sequence.map)
+                self._anywhere.prepare()
             except SkyfixError as error:
                 self._plan.without_whole_map()
                 self._note(frame, f"the whole map is not searched: {error}")
-
-    def _update_anywhere(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> float:
-        """Weigh all places on the map by all measurements since it is searched; track the one that wins."""
-        settings, motion = self._settings, accumulate(self._since_measured)
-        if self._candidates is None:  # the first one: begin anew, with what the filter knows as one guess of several
-            given_up = GivenUp.by(particles, self._drive.sequence.map.grid)
-            self._start_cloud = StartCloud(given_up, settings.particles, settings.outlier_probability, self._rng)
-        evidence = particles.update(measurement.likelihood, measurement.temperature).log_evidence
-        if len(self._start_cloud) < _START_MEASUREMENTS:
-            particles = self._filter_from_start(measurement, motion if len(self._start_cloud) else None)
-        self._candidates = Candidates.of(particles)
-        if self._plan.record_places(self._candidates.share):
-            cloud = self._candidates.heaviest_alone(particles, settings.particles, self._rng)
-            particles = ParticleFilter(cloud, self._rng, self._filter_settings())
-            self._candidates = None
-            self._watch.restart(self._travelled_m)
-            self._note(frame, f"found at ({cloud[:, 0].mean():.1f}, {cloud[:, 1].mean():.1f})")
-        self._filter = particles
-        return evidence
-
-    def _filter_settings(self) -> ParticleFilterSettings:
-        return ParticleFilterSettings(outlier_probability=self._settings.outlier_probability)
+        return self._plan.has_whole_map
 
     def _keep(self, frame: int, estimate: Estimate, measurement: Measurement | None) -> None:
         self.estimates.append(estimate)

@@ -128,12 +128,9 @@ class SearchPlan:
         """Whether searches are about the filter's prediction."""
         return self.phase in (Phase.TRACK, Phase.LOST)
 
-    def give_up(self) -> bool:
-        """Look for the vehicle on the whole map: it is not where the filter is. True when that changes the phase."""
-        if not (self.follows_filter and self.has_whole_map):
-            return False
+    def give_up(self) -> None:
+        """Look for the vehicle on the whole map from now on: it is not where the filter has it."""
         self.phase, self._won = Phase.ANYWHERE, 0
-        return True
 
     def record_places(self, share: float) -> bool:
         """Note the likeliest place's share of the posterior after a search of the whole map; True when it has won."""

@@ -25,6 +25,8 @@ from fusion.likelihood import PoseLikelihood
 from fusion.odometry import OdometryIncrement
 
 _BOX_SHARE = 0.2
+MOST_MEASUREMENTS = 8
+"""To make a cloud from: their volumes are kept in memory, and each costs the more the more there are."""
 
 
 class StartPrior(Protocol):
