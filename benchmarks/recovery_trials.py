@@ -81,6 +81,7 @@ def run_trial(kind: str, incident: Incident, matcher: MapMatcher, settings: Trac
         "last": incident.last,
         "error_m": [round(error, 3) for error in errors],
         "lost_score": [round(score, 6) for score in scores],
+        "measured": [row.measured for row in online.rows],
         "covered": covered,
         "start": [round(float(value), 2) for value in drive.truth.poses[incident.last]],
         "log": online.log,
@@ -114,6 +115,7 @@ def summary(kind: str, trials: list[Trial]) -> dict[str, Any]:
     found = [value for value, is_good in zip(after, good, strict=True) if is_good]
     errors = np.concatenate([trial["error_m"] for trial in trials])
     scores = np.concatenate([trial["lost_score"] for trial in trials])
+    measured = np.concatenate([trial["measured"] for trial in trials])
     blind = np.concatenate([trial["covered"][trial["first"] : trial["last"]] for trial in trials])
     return {
         "trials": len(trials),
@@ -124,6 +126,7 @@ def summary(kind: str, trials: list[Trial]) -> dict[str, Any]:
         "worst_m": max(found) if found else None,
         "median_noticed_m": float(np.median(noticed)) if noticed and kind == "kidnap" else None,
         "lost_score_auroc": auroc(scores, errors > LOST_M),
+        "lost_score_auroc_measured_frames": auroc(scores[measured], (errors > LOST_M)[measured]),
         "coverage95_outage": float(blind.mean()) if len(blind) else None,
         "cpu_s_per_trial": float(np.mean([trial["cpu_s"] for trial in trials])),
         "failed": [number for number, is_good in enumerate(good) if not is_good],

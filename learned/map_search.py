@@ -1,10 +1,8 @@
 """Search of a whole map: every pose scored on coarse cells, and the best places again on the vote's own cells.
 
-The coarse score of a cell is a vote with both feature images averaged over some 3 m and the scan's also over some
-5 degrees of heading; it is a mean of the scores nearby, so no sharp peak falls between the cells, but all are lowered.
-Around the best of them, and around poses that somebody asks about, each coarse cell is cut into the cells of the
-ordinary vote, whose scores are those of a narrow search. A mean of log densities is less than the log of a mean: what
-the cut places gain by it, in the median, is granted to all the others.
+Around the best coarse cells, and around poses that somebody asks about, each is cut into the cells of the ordinary
+vote, whose scores are those of a narrow search. A coarse score is a mean of log densities (`coarse_vote`) and so less
+than the log of a mean: what the cut places gain by it, in the median, is granted to all the others.
 
 The spectra of the map are worked out once, so the map's features should be handed over once for a drive. Source of the
 two steps: Olson, "Real-time correlative scan matching", ICRA 2009, section V (many-to-one resolutions).
@@ -13,7 +11,7 @@ two steps: Olson, "Real-time correlative scan matching", ICRA 2009, section V (m
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -25,10 +23,10 @@ from fusion.arrays import Float32Array, FloatArray, IntArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from fusion.two_level import TwoLevelLikelihood
+from learned.coarse_vote import CoarseVote, padded_size
 from learned.correlation import MapCorrelator, fast_length, template_spectrum
-from learned.voting import prior_scores, quarter_turn_groups, rotate_templates
+from learned.voting import prior_scores, rotate_templates
 
-_SUB_HEADINGS = 3
 _NEAR_M, _NEAR_RAD = 10.0, math.radians(10.0)
 MOST_CELLS = 100_000_000
 """Of the coarse level: 400 MB."""
@@ -46,15 +44,19 @@ class MapSearchSettings:
         At most so many of the best coarse cells are looked at closely, with their neighbours on all sides.
     range_nats
         Cells this far below the best are not looked at closely.
+    contrast_cell_m, contrast_heading_deg
+        Wanted size of a cell where only the contrast is asked for: coarser, as it is asked for often.
     """
 
     cell_m: float = 3.0
     heading_deg: float = 5.0
     places: int = 16
     range_nats: float = 12.0
+    contrast_cell_m: float = 5.0
+    contrast_heading_deg: float = 9.0
 
     def __post_init__(self) -> None:
-        if not (self.cell_m > 0.0 and self.heading_deg > 0.0 and self.places >= 1 and self.range_nats > 0.0):
+        if not all(getattr(self, entry.name) > 0 for entry in fields(self)):
             raise SkyfixError(f"map search: expected positive settings, got {self}")
 
 
@@ -93,11 +95,8 @@ class MapLattice:
     ) -> MapLattice:
         """Lay cells over the map `grid`; the window's sides are multiples of so many features."""
         side = _odd(settings.cell_m / feature_m)
-        turn = min(
-            (odd for odd in range(1, yaw_bins + 1, 2) if yaw_bins % odd == 0),
-            key=lambda odd: abs(math.log(odd * 360.0 / yaw_bins / settings.heading_deg)),
-        )
-        padded = 2 * side * math.ceil(template / (2 * side))
+        turn = _bins_together(yaw_bins, settings.heading_deg)
+        padded = padded_size(template, side)
         if grid.area_m2 * yaw_bins / turn > MOST_CELLS * (side * feature_m) ** 2:
             expected = f"at most {MOST_CELLS * (side * feature_m) ** 2 * turn / yaw_bins * 1e-6:.0f} km^2"
             raise SkyfixError(f"whole-map search: expected a map of {expected}, got {grid.area_m2 * 1e-6:.0f} km^2")
@@ -151,7 +150,10 @@ class MapSearch:
             raise SkyfixError(f"map features: expected (C, {wanted[0]}, {wanted[1]}), got {tuple(features.shape)}")
         self._features, self.lattice, self.settings = features, lattice, settings
         self._yaw_bins, self._temperature = yaw_bins, temperature
-        self._coarse_map = MapCorrelator(functional.avg_pool2d(features[None], lattice.side)[0])
+        self._coarse = CoarseVote(features, lattice.window, lattice.template, lattice.side, yaw_bins // lattice.turn)
+        side = _odd(settings.contrast_cell_m / lattice.window.metres_per_pixel)
+        bins = yaw_bins // _bins_together(yaw_bins, settings.contrast_heading_deg)
+        self._contrast = CoarseVote(features, lattice.window, lattice.template, side, bins)
         self._prior = None if prior is None else self._prior_of_cells(prior)
 
     def likelihood(self, scan: Tensor, near: FloatArray | None = None) -> TwoLevelLikelihood:
@@ -170,36 +172,22 @@ class MapSearch:
         return TwoLevelLikelihood.from_scores(lifted, self.lattice.coarse, cut, fine)
 
     def contrast(self, scan: Tensor, pose: FloatArray) -> float:
-        """Highest coarse score on the map less the highest near a pose (3,): within some 10 m and 12 degrees."""
+        """Highest coarse score on the map less the highest near a pose (3,): within some 10 m and 10 degrees."""
         with torch.inference_mode():
-            coarse = self._coarse_scores(scan)
-        grid, bins = self.lattice.coarse, coarse.shape[2]
-        reach = math.ceil(_NEAR_M / grid.metres_per_pixel - 0.5)
+            scores = self._contrast.scores(scan)
+        grid, bins = self._contrast.grid, self._contrast.bins
+        reach, half_turn = round(_NEAR_M / grid.metres_per_pixel), round(_NEAR_RAD * bins / se2.TWO_PI)
         row, col = (math.floor(at) for at in grid.pixel_from_xy(pose[:2]))
         turn = round(float(pose[2]) * bins / se2.TWO_PI)
-        half_turn = round(_NEAR_RAD * bins / se2.TWO_PI)
         yaws = np.arange(turn - half_turn, turn + half_turn + 1) % bins
-        near = coarse[max(row - reach, 0) : max(row + reach + 1, 0), max(col - reach, 0) : max(col + reach + 1, 0)]
-        best_near = near[:, :, yaws].max(initial=coarse.min())
-        return float(coarse.max() - best_near)
+        near = scores[max(row - reach, 0) : max(row + reach + 1, 0), max(col - reach, 0) : max(col + reach + 1, 0)]
+        highest = float(near[:, :, yaws].max(initial=scores.min()))
+        return (float(scores.max()) - highest) / self._temperature
 
     def _coarse_scores(self, scan: Tensor) -> Float32Array:
         """(rows, cols, K) on the coarse cells."""
-        lattice = self.lattice
-        bins = self._yaw_bins // lattice.turn
-        width = 2 * math.pi / bins
-        margin = (lattice.padded - lattice.template) // 2
-        spread = (torch.arange(_SUB_HEADINGS, dtype=torch.float64) - _SUB_HEADINGS // 2) / _SUB_HEADINGS * width
-        result = np.empty((lattice.coarse.rows, lattice.coarse.cols, bins), np.float32)
-        for yaw, members in quarter_turn_groups(torch.arange(bins, dtype=torch.float64) * width):
-            turned = rotate_templates(scan, yaw + spread).mean(dim=0)
-            padded = functional.pad(turned, (margin, margin, margin, margin))
-            template = functional.avg_pool2d(padded[None], lattice.side)[0] * lattice.side**2
-            for (index, _), scores in zip(
-                members, self._coarse_map.scores(template, [turns for _, turns in members]), strict=True
-            ):
-                used = scores[1 : lattice.coarse.rows + 1, 1 : lattice.coarse.cols + 1]
-                result[:, :, index] = used.numpy()
+        grid = self.lattice.coarse
+        result = self._coarse.scores(scan)[1 : grid.rows + 1, 1 : grid.cols + 1]
         if self._prior is not None:
             result += self._prior.mean(axis=(1, 3))[:, :, None]
         return result / np.float32(self._temperature)
@@ -294,3 +282,9 @@ def _log_mean(values: Float32Array) -> Float32Array:
 def _odd(number: float) -> int:
     """The odd number nearest to a positive one."""
     return max(2 * math.floor(number / 2) + 1, 1)
+
+
+def _bins_together(yaw_bins: int, heading_deg: float) -> int:
+    """The odd divisor of a number of yaw bins that makes coarse bins nearest to so many degrees."""
+    odd = [number for number in range(1, yaw_bins + 1, 2) if yaw_bins % number == 0]
+    return min(odd, key=lambda number: abs(math.log(number * 360.0 / yaw_bins / heading_deg)))

@@ -96,7 +96,7 @@ class TrackSettings:
     modes: int = 5
     lost_threshold: float = 0.5
     patience: int = 3
-    map_check_every_m: float = 8.0
+    map_check_every_m: float = 4.0
     lost_patience: int = 3
     relapse_m: float = 50.0
     whole_map_every_m: float = 8.0
