@@ -1,8 +1,9 @@
 """Looking for the vehicle on the whole map: the posterior of all measurements since it was given up, until one wins.
 
-As at a start, the cloud is made anew with each of the first measurements from all of them (`start_cloud`); after these
-it is an ordinary filter's. The scans are matched with the whole map, and looked at closely about the places where the
-cloud is, so that far-apart places are weighed against each other by one density.
+As at a start, the cloud is made anew with each of a few measurements from all of them (`start_cloud`); after these it
+begins once more, with the posterior so far as one half of what is known. The scans are matched with the whole map,
+and looked at closely about the places where the cloud is, so that far-apart places are weighed against each other by
+one density.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from learned.whole_map import WholeMapSearch, search_over
 from sequences.anywhere import Candidates, GivenUp, map_box
 from sequences.start_cloud import MOST_MEASUREMENTS, StartCloud
 from sequences.track_settings import TrackSettings
+
+_LEAST_PARTICLES = 20_000  # while they are all over the map
 
 
 class AnywhereSearch:
@@ -92,20 +95,19 @@ class AnywhereSearch:
         Parameters
         ----------
         particles
-            The filter, moved to this measurement and weighed by it; None at the start of a drive.
+            The filter, moved to this measurement and not weighed by it; None at the start of a drive.
         likelihood, temperature
             The measurement.
         motion
             Odometry since the one before; not looked at for the first.
         """
-        if self._cloud is None:
+        if self._cloud is None or (particles is not None and len(self._cloud) >= MOST_MEASUREMENTS):
             grid, settings = self._map.grid, self._settings
             prior = map_box(grid) if particles is None else GivenUp.by(particles, grid)
-            self._cloud = StartCloud(prior, settings.particles, settings.outlier_probability, self._rng)
+            count = max(settings.particles, _LEAST_PARTICLES)
+            self._cloud = StartCloud(prior, count, settings.outlier_probability, self._rng)
             motion = None
-        if particles is not None and len(self._cloud) >= MOST_MEASUREMENTS:
-            return particles
-        cloud, log_weights = self._cloud.add(likelihood.tempered(temperature), motion)
+        cloud, log_weights = self._cloud.add(likelihood.tempered(temperature), motion, likelihood)
         return ParticleFilter(cloud, self._rng, self._filter_settings, log_weights)
 
     def share(self, particles: ParticleFilter) -> float:

@@ -226,10 +226,11 @@ class FilterPass:
         return ParticleFilter(cloud, self._rng, settings, log_weights)
 
     def _update(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> float:
-        report = particles.update(measurement.likelihood, measurement.temperature)
         if isinstance(measurement.likelihood, TwoLevelLikelihood):
+            density = measurement.likelihood.log_density(particles.particles)
             self._update_anywhere(particles, frame, measurement.likelihood, measurement.temperature)
-            return report.log_evidence
+            return float(logsumexp(density + particles.log_weights))
+        report = particles.update(measurement.likelihood, measurement.temperature)
         if self._plan.record(measurement.search, report.log_evidence, report.lost_score):
             self._note(frame, f"searching for {self._plan.phase.value}")
             self._prepare_whole_map(frame)

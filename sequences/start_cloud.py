@@ -59,13 +59,19 @@ class StartCloud:
     def __init__(self, prior: StartPrior, size: int, outlier_probability: float, rng: np.random.Generator) -> None:
         self._prior, self._size, self._outlier_probability, self._rng = prior, size, outlier_probability, rng
         self._likelihoods: list[PoseLikelihood] = []
+        self._drawn_from: list[PoseLikelihood] = []
         self._drawn: list[FloatArray] = []
         self._motions: list[OdometryIncrement] = []
 
     def __len__(self) -> int:
         return len(self._likelihoods)
 
-    def add(self, likelihood: PoseLikelihood, motion: OdometryIncrement | None) -> tuple[FloatArray, FloatArray]:
+    def add(
+        self,
+        likelihood: PoseLikelihood,
+        motion: OdometryIncrement | None,
+        drawn_from: PoseLikelihood | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
         """Take in one more measurement.
 
         Parameters
@@ -74,13 +80,17 @@ class StartCloud:
             Flattened for errors shared with the measurement before.
         motion
             Odometry since that one; None for the first.
+        drawn_from
+            What poses are proposed from: the likelihood itself when left out. Over a large region the flattened
+            likelihood has most of its mass where hardly anything fits, and a sharper one makes the better proposal.
 
         Returns
         -------
         Particles (n, 3) at this measurement and their log weights (n,), not normalised.
         """
         self._likelihoods.append(likelihood)
-        self._drawn.append(likelihood.sample(self._size, self._rng))
+        self._drawn_from.append(drawn_from or likelihood)
+        self._drawn.append(self._drawn_from[-1].sample(self._size, self._rng))
         if motion is not None:
             self._motions.append(motion)
         paths = np.concatenate([self._carried(*proposal) for proposal in self._proposals()], axis=1)
@@ -114,8 +124,8 @@ class StartCloud:
         """Target over proposals, (n,), of paths (k + 1, n, 3)."""
         box = self._prior.log_density(paths[0])
         proposals, target = [box], box.copy()
-        for likelihood, poses in zip(self._likelihoods, paths, strict=True):
-            proposals.append(likelihood.log_density(poses))
+        for likelihood, drawn_from, poses in zip(self._likelihoods, self._drawn_from, paths, strict=True):
+            proposals.append(drawn_from.log_density(poses))
             target += likelihood.with_outliers(self._outlier_probability).log_density(poses)
         weights = target - logsumexp(np.array(proposals), axis=0, b=self._shares()[:, None])
         return np.maximum(weights, np.max(weights) - 700.0)
