@@ -7,7 +7,7 @@ over the search alone both are certain. So at times the scan is scored, coarsely
 
 is nothing or a few nats for a vehicle on track, since the best of millions of wrong poses beats the right one by chance
 at times, and much for one that is elsewhere. It enters a hidden Markov model of two states, `fusion.particles.lost`,
-with what chance alone can do taken off.
+with what chance alone can do taken off, and bounded: no scan decides alone.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 from fusion.particles.lost import LostModel, probability
 
 _BY_CHANCE_NATS = 3.0
+_MOST_NATS = 3.0  # that one scan can speak for being elsewhere: its errors may be gross
 _SUSPICION = 0.01
 _LEAST_AREA_M2 = 1e6
 
@@ -45,7 +46,7 @@ class MapWatch:
     def record(self, way_m: float, contrast_nats: float) -> float:
         """Take in a comparison; the probability of being elsewhere after it."""
         self._asked_at_m = way_m
-        self.lost = probability(self._model.log_odds(self.lost, 0.0, contrast_nats - _BY_CHANCE_NATS))
+        self.lost = probability(self._model.log_odds(self.lost, 0.0, min(contrast_nats - _BY_CHANCE_NATS, _MOST_NATS)))
         return self.lost
 
     def restart(self, way_m: float) -> None:
