@@ -65,3 +65,8 @@ class UniformPrior:
         poses = checked("poses", poses, (..., 3))
         in_square = (np.abs(poses[..., :2] - self.centre[:2]) <= self.half_extent_m).all(axis=-1)
         return in_square & (np.abs(se2.wrap(poses[..., 2] - self.centre[2])) <= self.half_heading_rad)
+
+    def log_density(self, poses: ArrayLike) -> FloatArray:
+        """ln density (...) per m^2 rad of poses (..., 3): the same all over the box, minus infinity outside."""
+        volume = (2.0 * self.half_extent_m) ** 2 * 2.0 * self.half_heading_rad
+        return np.where(self.contains(poses), -np.log(volume), -np.inf)

@@ -80,20 +80,30 @@ class _Correlation(torch.autograd.Function):
 
 
 class MapCorrelator:
-    """A map (C, H, W) to be correlated with many square templates, without gradients."""
+    """A map (C, H, W) to be correlated with many square templates, without gradients.
 
-    def __init__(self, map_features: Tensor) -> None:
+    Parameters
+    ----------
+    map_features
+        (C, H, W).
+    side
+        Of the transforms, at least that of the map; so that maps of several sizes can share a template's spectrum.
+    """
+
+    def __init__(self, map_features: Tensor, side: int | None = None) -> None:
         self._map = map_features
-        self._side = fast_length(max(map_features.shape[-2:]))
+        self._side = side or fast_length(max(map_features.shape[-2:]))
         self._spectra: dict[int, Tensor] = {}
 
     def scores(self, template: Tensor, quarter_turns: list[int]) -> list[Tensor]:
         """What `correlate` gives of a template (C, n, n), turned counter-clockwise by each number of quarter turns."""
         _check_sizes(self._map, template)
-        spectrum = torch.fft.rfft2(template, s=(self._side, self._side))
-        return [self._turned(spectrum, template.shape[-1], turns % 4) for turns in quarter_turns]
+        spectrum = template_spectrum(template, self._side)
+        return [self.scores_of(spectrum, template.shape[-1], turns) for turns in quarter_turns]
 
-    def _turned(self, spectrum: Tensor, size: int, turns: int) -> Tensor:
+    def scores_of(self, spectrum: Tensor, size: int, turns: int) -> Tensor:
+        """The same for one number of quarter turns, of the `template_spectrum` of a template of `size` cells."""
+        turns %= 4
         product = (spectrum * self._conjugate(turns)).sum(dim=0).conj().resolve_conj()
         height, width = self._map.shape[-2:] if turns % 2 == 0 else self._map.shape[:-3:-1]
         wanted_rows = torch.fft.ifft(product, dim=0)[: height - size + 1]
@@ -106,6 +116,12 @@ class MapCorrelator:
             turned = torch.rot90(self._map, -turns, dims=(1, 2))
             self._spectra[turns] = torch.fft.rfft2(turned, s=(self._side, self._side)).conj().resolve_conj()
         return self._spectra[turns]
+
+
+def template_spectrum(template: Tensor, side: int) -> Tensor:
+    """Spectrum (C, side, side / 2 + 1) of a template (C, n, n)."""
+    spectrum: Tensor = torch.fft.rfft2(template, s=(side, side))
+    return spectrum
 
 
 def _check_sizes(map_features: Tensor, templates: Tensor) -> None:

@@ -19,8 +19,10 @@ from fusion.errors import SkyfixError
 from fusion.likelihood import LikelihoodVolume
 from learned.bev import BODY, GROUND, HIGH, BevSettings, bev_counts
 from learned.map_raster import CLASS_INDEX, MapRaster
+from learned.map_search import MapLattice, MapSearch, MapSearchSettings
 from learned.matcher import SearchRegion, matching_window
 from learned.voting import bin_yaws, volume_from_scores, vote, yaw_bins_within
+from learned.whole_map import VotedMapSearch, WholeMapSearch
 
 _LINE_STRENGTH = {"wall": 1.0, "fence": 1.0, "hedge": 0.7, "tree": 0.4}
 
@@ -77,6 +79,15 @@ class GeometricMatcher:
         with torch.inference_mode():
             scores = vote(map_features(crop, self.weights), scan, bin_yaws(bins, self.yaw_bins))
         return volume_from_scores(scores / self.temperature, bins, self.yaw_bins, crop.grid)
+
+    def over_map(self, map_raster: MapRaster) -> WholeMapSearch:
+        """Prepare a whole map, see `learned.whole_map.WholeMapMatcher`."""
+        settings = MapSearchSettings()
+        mpp, size = self.bev.metres_per_pixel, self.bev.size
+        lattice = MapLattice.over(map_raster.grid, mpp, size, self.yaw_bins, 1, settings)
+        found = map_features(map_raster.resampled(lattice.window), self.weights)
+        search = MapSearch(found, lattice, self.yaw_bins, self.temperature, settings)
+        return VotedMapSearch(self.bev, lambda counts: (scan_features(counts), search))
 
 
 def scan_features(counts: NDArray[np.float32]) -> Tensor:

@@ -8,7 +8,9 @@ features may depend on both inputs, but not on the heading, which is unknown unt
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from collections.abc import Callable
+from functools import partial
+from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -22,9 +24,11 @@ from learned.bev import BANDS_M, BevSettings, bev_counts, log_density
 from learned.calibration import Calibration
 from learned.losses import HeadingQuadrature, scores_nll
 from learned.map_raster import MapRaster
+from learned.map_search import MapLattice, MapSearch, MapSearchSettings
 from learned.matcher import SearchRegion, matching_window
 from learned.network import Batch, NetworkSettings, picture_tensor
 from learned.voting import bin_yaws, prior_scores, volume_from_scores, vote, yaw_bins_within
+from learned.whole_map import VotedMapSearch, WholeMapSearch
 
 CROP_MULTIPLE = 16
 """Sides of map crops are multiples of this many pixels, the stride of the networks' coarsest level."""
@@ -70,6 +74,19 @@ class PoseScorer(Protocol):
 
         The lattice lies in the middle of the map: position (0, 0) is half the scan's image in from its corner.
         """
+        ...
+
+
+@runtime_checkable
+class SeparateEncoders(Protocol):
+    """A scorer whose map features do not depend on the scan, so that they can be kept."""
+
+    def scan_features(self, density: Tensor) -> Tensor:
+        """(B, bands, n, n) -> (B, C, n', n')."""
+        ...
+
+    def map_features(self, picture: Tensor) -> Tensor:
+        """(B, 3, H, W) -> (B, C, H', W')."""
         ...
 
 
@@ -191,6 +208,7 @@ class VotingMatcher(Generic[Net]):
         self._name, self.net = name, net
         self.calibration = calibration or Calibration()
         self.yaw_bins = yaw_bins
+        self._over_map: tuple[MapRaster, WholeMapSearch] | None = None
 
     @property
     def name(self) -> str:
@@ -219,6 +237,39 @@ class VotingMatcher(Generic[Net]):
             scores = self.net.pose_scores(density, picture, bin_yaws(bins, self.yaw_bins))
         return volume_from_scores(scores / self.calibration.temperature, bins, self.yaw_bins, grid, self.net.stride)
 
+    def over_map(self, map_raster: MapRaster) -> WholeMapSearch | None:
+        """Prepare a whole map, see `learned.whole_map.WholeMapMatcher`; the last one is kept.
+
+        A network whose features depend on scan and map together works on the whole map anew for every scan.
+        """
+        if self._over_map is None or self._over_map[0] is not map_raster:
+            search = self._search_of(map_raster)
+            if search is None:
+                return None
+            self._over_map = map_raster, search
+        return self._over_map[1]
+
+    def _search_of(self, map_raster: MapRaster) -> WholeMapSearch | None:
+        net: object = self.net
+        if not isinstance(net, SeparateEncoders | VotingNet):
+            return None
+        bev, stride = self.net.settings.bev, self.net.stride
+        feature_m, settings = bev.metres_per_pixel * stride, MapSearchSettings()
+        template, multiple = bev.size // stride, CROP_MULTIPLE // stride
+        lattice = MapLattice.over(map_raster.grid, feature_m, template, self.yaw_bins, multiple, settings)
+        rows, cols = lattice.window.rows * stride, lattice.window.cols * stride
+        pixels = MapGrid(rows, cols, bev.metres_per_pixel, lattice.window.x0, lattice.window.y0)
+        picture = picture_tensor(map_raster.resampled(pixels).picture)[None]
+
+        def search(found: Tensor, prior: Tensor | None) -> MapSearch:
+            return MapSearch(found, lattice, self.yaw_bins, self.calibration.temperature, settings, prior)
+
+        if isinstance(net, SeparateEncoders):
+            with torch.inference_mode():
+                kept = search(net.map_features(picture)[0], None)
+            return VotedMapSearch(bev, partial(_kept_features, net, kept))
+        return VotedMapSearch(bev, partial(_joint_features, net, picture, search))
+
     def images(
         self, counts: NDArray[np.float32], map_raster: MapRaster, search: SearchRegion
     ) -> tuple[Tensor, Tensor, MapGrid]:
@@ -228,3 +279,26 @@ class VotingMatcher(Generic[Net]):
         window = matching_window(map_raster, search, reach, bev.metres_per_pixel, multiple_of=CROP_MULTIPLE)
         crop = map_raster.resampled(window)
         return torch.from_numpy(log_density(counts)).float(), picture_tensor(crop.picture), crop.grid
+
+
+def _density(counts: NDArray[np.float32]) -> Tensor:
+    """Log densities (1, bands, n, n)."""
+    return torch.from_numpy(log_density(counts)).float()[None]
+
+
+def _kept_features(net: SeparateEncoders, kept: MapSearch, counts: NDArray[np.float32]) -> tuple[Tensor, MapSearch]:
+    """A scan's features, and the map's as they were."""
+    with torch.inference_mode():
+        return net.scan_features(_density(counts))[0], kept
+
+
+def _joint_features(
+    net: VotingNet,
+    picture: Tensor,
+    search: Callable[[Tensor, Tensor | None], MapSearch],
+    counts: NDArray[np.float32],
+) -> tuple[Tensor, MapSearch]:
+    """A scan's features and the map's, made together."""
+    with torch.inference_mode():
+        scan, found, prior = net.features(_density(counts), picture)
+        return scan[0], search(found[0], None if prior is None else prior[0])

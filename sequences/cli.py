@@ -32,6 +32,7 @@ from sequences.cli_options import (
     PickleOption,
     QuietOption,
     SeedOption,
+    StartAnywhereOption,
     training_line,
 )
 
@@ -69,7 +70,8 @@ def demo(
 @app.command(
     epilog="Examples:\n\n"
     "`skyfix track drives/kitti_13 --odometry lidar_gicp`\n\n"
-    "`skyfix track drives/mine --start 12.5 -80 90 --half-extent 30 --heading-unknown --out runs/mine`"
+    "`skyfix track drives/mine --start 12.5 -80 90 --half-extent 30 --heading-unknown --out runs/mine`\n\n"
+    "`skyfix track drives/mine --start-anywhere`"
 )
 def track(
     sequence: Annotated[
@@ -95,6 +97,7 @@ def track(
             metavar="X Y YAW",
         ),
     ] = None,
+    start_anywhere: StartAnywhereOption = False,
     half_extent: HalfExtentOption = 20.0,
     half_heading_deg: HalfHeadingOption = 10.0,
     heading_unknown: HeadingUnknownOption = False,
@@ -131,6 +134,7 @@ def track(
         half_extent_m=half_extent,
         half_heading_deg=180.0 if heading_unknown else half_heading_deg,
         start=start,
+        start_anywhere=start_anywhere,
         measure_every_m=measure_every_m,
         measure_every_frames=measure_every_frames,
         correlation_length_m=correlation_length_m,

@@ -37,6 +37,13 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")
 HeadingUnknownOption = Annotated[
     bool, typer.Option("--heading-unknown", help="The start's heading may be anything, as with --half-heading-deg 180.")
 ]
+StartAnywhereOption = Annotated[
+    bool,
+    typer.Option(
+        "--start-anywhere",
+        help="Nothing is known of the start, not even the heading: it is looked for on the whole map.",
+    ),
+]
 HalfExtentOption = Annotated[
     float, typer.Option(help="The start is known to within a square of this half side, metres.", metavar="M")
 ]

@@ -5,32 +5,35 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import logsumexp
 
 from fusion.arrays import FloatArray
 from fusion.consistency import correlated_error_temperature
+from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.graph.patch import LikelihoodPatch
 from fusion.odometry import OdometryIncrement, accumulate
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.prior import UniformPrior
-from learned.matcher import MapMatcher, SearchRegion
+from fusion.two_level import TwoLevelLikelihood
+from learned.matcher import MapMatcher
+from sequences.anywhere_search import AnywhereSearch
 from sequences.drive import Drive
+from sequences.map_watch import MapWatch
 from sequences.measurement import Measurement
 from sequences.run_result import FrameRow, Snapshot
 from sequences.search import Phase, SearchPlan
 from sequences.sequence import ScanError
 from sequences.snapshots import take_snapshot
-from sequences.start_cloud import StartCloud
+from sequences.start_cloud import MOST_MEASUREMENTS, StartCloud
 from sequences.track_settings import TrackSettings
 from sequences.trajectory_io import format_seconds
 
 STAGES = ("scan", "match", "predict", "update")
 _FILTER_STREAM = 1
-_START_MEASUREMENTS = 8  # volumes kept in memory at most
 
 
 @dataclass(slots=True)
@@ -46,7 +49,8 @@ class Stopwatch:
         try:
             yield
         finally:
-            self.milliseconds[stage] = 1e3 * (time.perf_counter() - begin)
+            taken = 1e3 * (time.perf_counter() - begin)
+            self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + taken
 
 
 class FilterPass:
@@ -99,6 +103,10 @@ class FilterPass:
         self._rng = np.random.default_rng([settings.seed, _FILTER_STREAM])
         self._start_cloud = StartCloud(prior, settings.particles, settings.outlier_probability, self._rng)
         self._plan = SearchPlan(prior, settings)
+        self._watch = MapWatch(settings.map_check_every_m, drive.sequence.map.grid.area_m2)
+        self._anywhere = AnywhereSearch(matcher, drive.sequence.map, drive.sequence.ground_z, settings, self._rng)
+        if settings.start_anywhere:
+            self._anywhere.prepare()
 
     def step(self, frame: int) -> FrameRow:
         """Process one frame; frames come in order from 0.
@@ -111,7 +119,7 @@ class FilterPass:
         watch, reason, evidence = Stopwatch(), "", None
         measurement: Measurement | None
         if self._filter is None:
-            measurement = self._measure(frame, self._plan.region(None), watch)
+            measurement = self._measure(frame, None, watch)
             with watch("update"):
                 self._filter, evidence = self._start(measurement)
         else:
@@ -121,7 +129,9 @@ class FilterPass:
             if measurement is not None:
                 with watch("update"):
                     evidence = self._update(self._filter, frame, measurement)
-        estimate = self._filter.estimate(self._stamp(frame))
+                with watch("match"):
+                    self._look_around(self._filter, frame, measurement)
+        estimate = self._estimate(self._filter, frame)
         self._keep(frame, estimate, measurement)
         self.rows.append(
             FrameRow(
@@ -140,6 +150,13 @@ class FilterPass:
         )
         return self.rows[-1]
 
+    def _estimate(self, particles: ParticleFilter, frame: int) -> Estimate:
+        """The filter's, or that of the likeliest place on the map; as lost as the whole map says, if that is more."""
+        if self._anywhere.is_running:
+            return self._anywhere.estimate(particles, self._stamp(frame))
+        estimate = particles.estimate(self._stamp(frame))
+        return replace(estimate, lost_score=max(estimate.lost_score, self._watch.lost))
+
     def _move(self, particles: ParticleFilter, frame: int) -> None:
         increment = self._increments[frame - 1]
         particles.predict(increment)
@@ -150,7 +167,10 @@ class FilterPass:
     def _due(self) -> bool:
         if self._settings.measure_every_frames is not None:
             return len(self._since_measured) >= self._settings.measure_every_frames
-        return self._travelled_m - self._measured_at_m >= self._settings.measure_every_m
+        every_m = self._settings.measure_every_m
+        if self._plan.phase is Phase.ANYWHERE:
+            every_m = max(every_m, self._settings.whole_map_every_m)
+        return self._travelled_m - self._measured_at_m >= every_m
 
     def _measure_if_due(
         self, particles: ParticleFilter, frame: int, watch: Stopwatch
@@ -159,27 +179,34 @@ class FilterPass:
         if not self._due():
             return None, ""
         prediction = particles.estimate(self._stamp(frame))
-        if not self._drive.sequence.map.grid.contains(prediction.pose[:2]):
+        is_anywhere = self._plan.phase is Phase.ANYWHERE
+        if not (is_anywhere or self._drive.sequence.map.grid.contains(prediction.pose[:2])):
             reason = "the prediction lies outside the map"
         else:
             try:
-                return self._measure(frame, self._plan.region(prediction), watch), ""
+                return self._measure(frame, prediction, watch), ""
             except ScanError as error:
                 reason = str(error)
         self._note(frame, f"not measured: {reason}")
         return None, reason
 
-    def _measure(self, frame: int, search: SearchRegion, watch: Stopwatch) -> Measurement:
+    def _measure(self, frame: int, prediction: Estimate | None, watch: Stopwatch) -> Measurement:
         sequence = self._drive.sequence
         with watch("scan"):
             points = sequence.scan(int(self._drive.indices[frame]))
+        if self._plan.phase is Phase.ANYWHERE:
+            with watch("match"):
+                everywhere = self._anywhere.match(points, self._filter)
+            return Measurement(points, self._anywhere.region(), everywhere, self._temperature())
+        search = self._plan.region(prediction)
         with watch("match"):
             likelihood = self._matcher.match(points, sequence.ground_z, sequence.map, search)
         return Measurement(points, search, likelihood, self._temperature())
 
     def _temperature(self) -> float:
-        """1 for the first measurement of a drive, more when little way lies between two of them."""
-        if self._filter is None or self._correlation_m == 0.0:
+        """1 for the first measurement of a drive or a search, more when little way lies between two of them."""
+        is_first = self._filter is None or (self._plan.phase is Phase.ANYWHERE and not self._anywhere.is_running)
+        if is_first or self._correlation_m == 0.0:
             return 1.0
         return correlated_error_temperature(self._travelled_m - self._measured_at_m, self._correlation_m)
 
@@ -187,7 +214,10 @@ class FilterPass:
         """The filter after the first measurement, and the ln density that it gave to the start's box."""
         in_box = self._prior.sample(self._settings.particles, self._rng)
         density = measurement.likelihood.log_density(in_box)
-        return self._filter_from_start(measurement, None), float(logsumexp(density) - np.log(len(density)))
+        evidence = float(logsumexp(density) - np.log(len(density)))
+        if isinstance(measurement.likelihood, TwoLevelLikelihood):
+            return self._anywhere.update(None, measurement.likelihood, measurement.temperature, None), evidence
+        return self._filter_from_start(measurement, None), evidence
 
     def _filter_from_start(self, measurement: Measurement, motion: OdometryIncrement | None) -> ParticleFilter:
         """A filter with the posterior of all measurements since the start."""
@@ -197,14 +227,52 @@ class FilterPass:
         return ParticleFilter(cloud, self._rng, settings, log_weights)
 
     def _update(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> float:
+        if isinstance(measurement.likelihood, TwoLevelLikelihood):
+            density = measurement.likelihood.log_density(particles.particles)
+            self._update_anywhere(particles, frame, measurement.likelihood, measurement.temperature)
+            return float(logsumexp(density + particles.log_weights))
         report = particles.update(measurement.likelihood, measurement.temperature)
         if self._plan.record(measurement.search, report.log_evidence, report.lost_score):
             self._note(frame, f"searching for {self._plan.phase.value}")
-        if self._plan.phase is Phase.START and len(self._start_cloud) < _START_MEASUREMENTS:
+            self._prepare_whole_map(frame)
+        if self._plan.phase is Phase.START and len(self._start_cloud) < MOST_MEASUREMENTS:
             self._filter = self._filter_from_start(measurement, accumulate(self._since_measured))
         elif report.injected:
             self._note(frame, f"evidence collapsed: {report.injected} particles drawn anew from the measurement")
         return report.log_evidence
+
+    def _update_anywhere(
+        self, particles: ParticleFilter, frame: int, likelihood: TwoLevelLikelihood, temperature: float
+    ) -> None:
+        """Weigh all places on the map; track the one that wins."""
+        particles = self._anywhere.update(particles, likelihood, temperature, accumulate(self._since_measured))
+        if self._plan.record_places(self._anywhere.share(particles)):
+            particles = self._anywhere.settle(particles)
+            self._watch.restart(self._travelled_m)
+            x, y, _ = particles.estimate(self._stamp(frame)).pose
+            self._note(frame, f"found at ({x:.1f}, {y:.1f})")
+        self._filter = particles
+
+    def _look_around(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> None:
+        """Now and then, ask the whole map whether the vehicle is where the filter has it; if not, search all of it."""
+        is_due = self._plan.phase is Phase.LOST or self._watch.is_due(self._travelled_m)
+        if not (is_due and self._plan.follows_filter and self._prepare_whole_map(frame)):
+            return
+        contrast = self._anywhere.contrast(measurement.points, particles.estimate(self._stamp(frame)).pose)
+        if self._watch.record(self._travelled_m, contrast) > self._settings.lost_threshold:
+            self._plan.give_up()
+            self._note(frame, f"searching for {self._plan.phase.value}: this scan fits elsewhere")
+            self._update_anywhere(particles, frame, self._anywhere.match(measurement.points, particles), 1.0)
+
+    def _prepare_whole_map(self, frame: int) -> bool:
+        """Have the map ready to be searched; when the matcher cannot, say so once and search about the filter."""
+        if self._plan.has_whole_map:
+            try:
+                self._anywhere.prepare()
+            except SkyfixError as error:
+                self._plan.without_whole_map()
+                self._note(frame, f"the whole map is not searched: {error}")
+        return self._plan.has_whole_map
 
     def _keep(self, frame: int, estimate: Estimate, measurement: Measurement | None) -> None:
         self.estimates.append(estimate)
@@ -213,8 +281,8 @@ class FilterPass:
             return
         self.best[frame] = measurement.best_pose()
         self._measured_at_m, self._since_measured = self._travelled_m, []
-        due_at_m = len(self.snapshots) * self._drive.odometry.length_m / self._settings.snapshots
-        if len(self.snapshots) < self._settings.snapshots and self._travelled_m >= due_at_m:
+        kept, wanted = len(self.snapshots), self._settings.snapshots
+        if kept < wanted and self._travelled_m >= kept * self._drive.odometry.length_m / wanted:
             sequence, truth = self._drive.sequence, self._drive.truth
             self.snapshots.append(
                 take_snapshot(

@@ -11,6 +11,7 @@ from fusion.arrays import Float32Array, FloatArray
 from fusion.estimate import Estimate
 from fusion.graph.patch import LikelihoodPatch, Neighbourhood, patch_of
 from fusion.likelihood import LikelihoodVolume
+from fusion.two_level import TwoLevelLikelihood
 from learned.matcher import SearchRegion
 
 _NEIGHBOURS = np.array([-1, 0, 1])
@@ -28,14 +29,14 @@ class Measurement:
     search
         The poses that were scored.
     likelihood
-        As the matcher gave it.
+        As the matcher gave it: a volume about a prediction, or two levels over a whole map.
     temperature
         By which the filter and the smoother flatten it, for errors shared with the measurement before.
     """
 
     points: Float32Array
     search: SearchRegion
-    likelihood: LikelihoodVolume
+    likelihood: LikelihoodVolume | TwoLevelLikelihood
     temperature: float
 
     def patch(self, estimate: Estimate) -> LikelihoodPatch:
@@ -47,8 +48,16 @@ class Measurement:
         return patch_of(self.likelihood.tempered(self.temperature), around)
 
     def best_pose(self) -> FloatArray:
-        """The matcher's own answer, see `best_pose`."""
+        """The matcher's own answer, see `best_pose`; over a whole map, the mean of the heaviest mode."""
+        if isinstance(self.likelihood, TwoLevelLikelihood):
+            return self.likelihood.modes(1).means[0]
         return best_pose(self.likelihood)
+
+    def heat(self) -> Float32Array:
+        """(rows, cols) ln density, the highest over the headings, on the cells of the likelihood's grid."""
+        if isinstance(self.likelihood, TwoLevelLikelihood):
+            return self.likelihood.coarse.max(axis=2)
+        return self.likelihood.log_prob.max(axis=2)
 
 
 def best_pose(volume: LikelihoodVolume) -> FloatArray:

@@ -64,7 +64,7 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
 
 def _methods(result: RunResult, truth: Trajectory) -> dict[str, Any]:
     trajectories = {
-        "prior": prior_answers(truth, result.settings),
+        "prior": prior_answers(truth, result.settings, result.prior),
         "odometry": result.odometry,
         "single_shot": result.single_shot,
         "filter": result.filter,

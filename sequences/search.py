@@ -1,9 +1,11 @@
-"""Where a scan is looked for on the map: widely until the start is settled, then about the filter's prediction.
+"""Where a scan is looked for on the map: widely until the start is settled, then about the filter's prediction, and
+on the whole map when that has failed.
 
 The truth never enters. A likelihood that was evaluated in a narrow search cannot say that nothing in it fits, and a
 filter that began on the wrong street confirms itself there. So at first every search covers the start's whole box,
 carried along by the odometry, in all of its headings. It narrows when several measurements in a row have agreed with
-the filter, and widens when several have not.
+the filter, and widens when several have not. A wide search always finds something that fits best, so a vehicle that
+it does not find again soon, or loses again soon, is looked for on the whole map, until one place has won.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ _AGREEMENT_NATS = 1.0  # by which the prediction explains a measurement better t
 _HEADING_MARGIN_RAD = math.radians(1.0)
 _LOST_HALF_HEADING_RAD = math.radians(45.0)
 _ABOUT_THE_START_RAD = math.radians(60.0)
+_WINS = 2  # measurements in a row after which the same place leads
 
 
 class Phase(Enum):
@@ -32,6 +35,7 @@ class Phase(Enum):
     START = "the start"
     TRACK = "the vehicle about the filter's prediction"
     LOST = "a lost vehicle"
+    ANYWHERE = "the vehicle on the whole map"
 
 
 class SearchPlan:
@@ -50,11 +54,21 @@ class SearchPlan:
         self._moved = np.zeros(3)  # odometry since the start, seen from the first body frame
         self._agreeing = self._disagreeing = 0
         self._lost_half_heading_rad = prior.half_heading_rad
-        self.phase = Phase.START
+        self._way_m, self._found_at_m = 0.0, -math.inf  # odometry's path; where a wide search last found the vehicle
+        self._searched_widely = self._won = 0
+        self.has_whole_map = True
+        self.phase = Phase.ANYWHERE if settings.start_anywhere else Phase.START
+
+    def without_whole_map(self) -> None:
+        """Never look for the vehicle on the whole map: the matcher cannot."""
+        self.has_whole_map = False
+        if self.phase is Phase.ANYWHERE:
+            self.phase, self._searched_widely = Phase.LOST, 0
 
     def move(self, delta: FloatArray) -> None:
         """Carry the start's box along by an odometry increment (3,), in the body frame before it."""
         self._moved = se2.compose(self._moved, delta)
+        self._way_m += float(np.hypot(delta[0], delta[1]))
 
     def region(self, prediction: Estimate | None) -> SearchRegion:
         """The poses to score; `prediction` is the filter's, None before there is one."""
@@ -93,12 +107,43 @@ class SearchPlan:
         self._agreeing = self._agreeing + 1 if nats > _AGREEMENT_NATS and not is_lost else 0
         self._disagreeing = self._disagreeing + 1 if is_lost else 0
         before = self.phase
+        if before is Phase.LOST:
+            self._searched_widely += 1
         if self._agreeing >= self._settings.patience:
-            self.phase = Phase.TRACK
-            self._lost_half_heading_rad = _LOST_HALF_HEADING_RAD
+            if before is Phase.LOST:
+                self._found_at_m = self._way_m
+            self._track()
         elif self.phase is Phase.TRACK and self._disagreeing >= self._settings.patience:
-            self.phase = Phase.LOST
+            has_relapsed = self._way_m - self._found_at_m < self._settings.relapse_m
+            self.phase = Phase.ANYWHERE if has_relapsed and self.has_whole_map else Phase.LOST
+            self._searched_widely = 0
+        elif before is Phase.LOST and self._searched_widely >= self._settings.lost_patience and self.has_whole_map:
+            self.phase = Phase.ANYWHERE
+        if self.phase is Phase.ANYWHERE:
+            self._won = 0
         return self.phase is not before
+
+    @property
+    def follows_filter(self) -> bool:
+        """Whether searches are about the filter's prediction."""
+        return self.phase in (Phase.TRACK, Phase.LOST)
+
+    def give_up(self) -> None:
+        """Look for the vehicle on the whole map from now on: it is not where the filter has it."""
+        self.phase, self._won = Phase.ANYWHERE, 0
+
+    def record_places(self, share: float) -> bool:
+        """Note the likeliest place's share of the posterior after a search of the whole map; True when it has won."""
+        self._won = self._won + 1 if share >= self._settings.winner_share else 0
+        if self._won < _WINS:
+            return False
+        self._track()
+        return True
+
+    def _track(self) -> None:
+        self.phase = Phase.TRACK
+        self._agreeing = self._disagreeing = 0
+        self._lost_half_heading_rad = _LOST_HALF_HEADING_RAD
 
     @property
     def _widest_start_m(self) -> float:

@@ -38,7 +38,7 @@ def take_snapshot(
         index=index,
         bev=log_density(bev_counts(measurement.points, ground_z, BevSettings())),
         map_crop=map_raster.crop(window),
-        heat=measurement.likelihood.log_prob.max(axis=2),
+        heat=measurement.heat(),
         heat_grid=measurement.likelihood.grid,
         truth=truth,
         estimate=estimate,

@@ -10,6 +10,7 @@ from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
+from sequences.anywhere import map_box
 from sequences.drive import Drive
 from sequences.sequence import Sequence
 from sequences.track_settings import TrackSettings
@@ -21,13 +22,15 @@ def start_prior(drive: Drive, settings: TrackSettings) -> UniformPrior:
     """The box that the first pose lies in.
 
     Its centre is the given start; without one, the true first pose plus an offset drawn uniformly from the box, so
-    that the truth is uniform in it.
+    that the truth is uniform in it. The square about the whole map when nothing is known.
 
     Raises
     ------
     SkyfixError
         If the start is outside the map, or there is neither a start nor ground truth to draw one from.
     """
+    if settings.start_anywhere:
+        return map_box(drive.sequence.map.grid)
     half = (settings.half_extent_m, settings.half_heading_rad)
     if settings.start is not None:
         x, y, yaw_deg = settings.start
@@ -41,13 +44,15 @@ def start_prior(drive: Drive, settings: TrackSettings) -> UniformPrior:
     return UniformPrior(first + offset_in_box(*half, rng, 1)[0], *half)
 
 
-def prior_answers(truth: Trajectory, settings: TrackSettings) -> Trajectory:
+def prior_answers(truth: Trajectory, settings: TrackSettings, prior: UniformPrior | None = None) -> Trajectory:
     """What the prior's mean scores as an answer for every frame.
 
     A box of the start's size is laid around every true pose at a seeded random offset, the way the first frame's is,
     and its centre is the answer: what a single-shot method gets that returns the centre of its initial search,
-    whatever it sees.
+    whatever it sees. With a start anywhere on the map, `prior`, there is one such box for all of them.
     """
+    if settings.start_anywhere and prior is not None:
+        return Trajectory(truth.stamp_ns, np.tile(prior.mean, (len(truth), 1)), None, truth.frame_id)
     rng = np.random.default_rng([settings.seed, _PRIOR_STREAM])
     offsets = offset_in_box(settings.half_extent_m, settings.half_heading_rad, rng, len(truth))
     return Trajectory(truth.stamp_ns, truth.poses + offsets, None, truth.frame_id)

@@ -14,6 +14,8 @@ Carlo rendering", 1995: the balance heuristic). The odometry's density is common
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from scipy.special import logsumexp
 
@@ -21,9 +23,22 @@ from fusion import se2
 from fusion.arrays import FloatArray
 from fusion.likelihood import PoseLikelihood
 from fusion.odometry import OdometryIncrement
-from fusion.prior import UniformPrior
 
 _BOX_SHARE = 0.2
+MOST_MEASUREMENTS = 8
+"""To make a cloud from: their volumes are kept in memory, and each costs the more the more there are."""
+
+
+class StartPrior(Protocol):
+    """What is known of the first pose beforehand; `fusion.prior.UniformPrior` is one."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw poses (n, 3)."""
+        ...
+
+    def log_density(self, poses: FloatArray) -> FloatArray:
+        """ln density (N,) at poses (N, 3), per m^2 rad; minus infinity where the first pose cannot be."""
+        ...
 
 
 class StartCloud:
@@ -32,7 +47,7 @@ class StartCloud:
     Parameters
     ----------
     prior
-        The start's box.
+        What is known of the first pose: the start's box.
     size
         Number of particles.
     outlier_probability
@@ -41,16 +56,22 @@ class StartCloud:
         Source of all randomness.
     """
 
-    def __init__(self, prior: UniformPrior, size: int, outlier_probability: float, rng: np.random.Generator) -> None:
+    def __init__(self, prior: StartPrior, size: int, outlier_probability: float, rng: np.random.Generator) -> None:
         self._prior, self._size, self._outlier_probability, self._rng = prior, size, outlier_probability, rng
         self._likelihoods: list[PoseLikelihood] = []
+        self._drawn_from: list[PoseLikelihood] = []
         self._drawn: list[FloatArray] = []
         self._motions: list[OdometryIncrement] = []
 
     def __len__(self) -> int:
         return len(self._likelihoods)
 
-    def add(self, likelihood: PoseLikelihood, motion: OdometryIncrement | None) -> tuple[FloatArray, FloatArray]:
+    def add(
+        self,
+        likelihood: PoseLikelihood,
+        motion: OdometryIncrement | None,
+        drawn_from: PoseLikelihood | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
         """Take in one more measurement.
 
         Parameters
@@ -59,13 +80,17 @@ class StartCloud:
             Flattened for errors shared with the measurement before.
         motion
             Odometry since that one; None for the first.
+        drawn_from
+            What poses are proposed from: the likelihood itself when left out. Over a large region the flattened
+            likelihood has most of its mass where hardly anything fits, and a sharper one makes the better proposal.
 
         Returns
         -------
         Particles (n, 3) at this measurement and their log weights (n,), not normalised.
         """
         self._likelihoods.append(likelihood)
-        self._drawn.append(likelihood.sample(self._size, self._rng))
+        self._drawn_from.append(drawn_from or likelihood)
+        self._drawn.append(self._drawn_from[-1].sample(self._size, self._rng))
         if motion is not None:
             self._motions.append(motion)
         paths = np.concatenate([self._carried(*proposal) for proposal in self._proposals()], axis=1)
@@ -97,14 +122,10 @@ class StartCloud:
 
     def _log_weights(self, paths: FloatArray) -> FloatArray:
         """Target over proposals, (n,), of paths (k + 1, n, 3)."""
-        box = np.where(self._prior.contains(paths[0]), self._log_box_density(), -np.inf)
+        box = self._prior.log_density(paths[0])
         proposals, target = [box], box.copy()
-        for likelihood, poses in zip(self._likelihoods, paths, strict=True):
-            proposals.append(likelihood.log_density(poses))
+        for likelihood, drawn_from, poses in zip(self._likelihoods, self._drawn_from, paths, strict=True):
+            proposals.append(drawn_from.log_density(poses))
             target += likelihood.with_outliers(self._outlier_probability).log_density(poses)
         weights = target - logsumexp(np.array(proposals), axis=0, b=self._shares()[:, None])
         return np.maximum(weights, np.max(weights) - 700.0)
-
-    def _log_box_density(self) -> float:
-        box = self._prior
-        return -float(np.log((2.0 * box.half_extent_m) ** 2 * 2.0 * box.half_heading_rad))

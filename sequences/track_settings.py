@@ -27,6 +27,8 @@ class TrackSettings:
     start
         Centre of that box, x and y in metres and yaw in degrees in the map frame. None: the true first pose plus an
         offset drawn uniformly from the box, which needs ground truth.
+    start_anywhere
+        Nothing is known of the start, not even the heading: it is looked for on the whole map.
     measure_every_m
         A scan is matched with the map when the odometry has moved this far since the last one that was.
     measure_every_frames
@@ -53,6 +55,18 @@ class TrackSettings:
     lost_threshold, patience
         A measurement agrees with the filter when it fits its prediction and leaves its lost score below the threshold.
         The search narrows after so many in a row that do, and widens after so many that do not.
+    map_check_every_m
+        While the vehicle is tracked, a scan is compared with the whole map every so many metres (see `map_watch`),
+        where the matcher can; 0 for never. It decides on nothing but whether the vehicle is lost.
+    lost_patience
+        A vehicle that so many wide searches have not found again is looked for on the whole map.
+    relapse_m
+        So is one that is lost again within this distance of having been found by a wide search.
+    whole_map_every_m
+        While it is looked for on the whole map, a scan is matched every so many metres (never more often than
+        otherwise).
+    winner_share
+        It is found when one place holds this share of the posterior, twice in a row.
     snapshots
         Measured frames kept for the report.
     noise
@@ -65,6 +79,7 @@ class TrackSettings:
     half_extent_m: float = 20.0
     half_heading_deg: float = 10.0
     start: tuple[float, float, float] | None = None
+    start_anywhere: bool = False
     measure_every_m: float = 4.0
     measure_every_frames: int | None = None
     search_min_half_extent_m: float = 12.0
@@ -78,6 +93,11 @@ class TrackSettings:
     outlier_probability: float = 0.05
     lost_threshold: float = 0.5
     patience: int = 3
+    map_check_every_m: float = 4.0
+    lost_patience: int = 3
+    relapse_m: float = 50.0
+    whole_map_every_m: float = 8.0
+    winner_share: float = 0.9
     snapshots: int = 6
     noise: OdometryNoise = field(default_factory=OdometryNoise)
 
@@ -89,7 +109,7 @@ class TrackSettings:
                 raise SkyfixError(f"{entry.name}: expected a finite number, got {value}")
         positive = ("particles", "half_extent_m", "half_heading_deg", "patience", "search_sigmas")
         lengths = ("search_min_half_extent_m", "search_max_half_extent_m", "search_min_half_heading_deg")
-        for name in (*positive, *lengths):
+        for name in (*positive, "lost_patience", *lengths):
             if getattr(self, name) <= 0:
                 raise SkyfixError(f"{name}: expected more than 0, got {getattr(self, name)}")
         if self.half_heading_deg > 180.0:
@@ -102,17 +122,24 @@ class TrackSettings:
             "search_start_growth_m",
             "map_error_m",
             "correlation_length_m",
+            "map_check_every_m",
+            "relapse_m",
+            "whole_map_every_m",
             "snapshots",
         ):
             if (getattr(self, name) or 0) < 0:
                 raise SkyfixError(f"{name}: expected 0 or more, got {getattr(self, name):g}")
+        if not 0.5 < self.winner_share < 1.0:
+            raise SkyfixError(f"winner_share: expected above 0.5 and below 1, got {self.winner_share:g}")
+        if self.start_anywhere and self.start is not None:
+            raise SkyfixError(f"start: expected none with start_anywhere, got {self.start}")
         if self.seed < 0:
             raise SkyfixError(f"seed: expected 0 or more, got {self.seed}")
 
     @property
     def heading_unknown(self) -> bool:
         """Whether the start's heading is anything."""
-        return self.half_heading_deg >= 180.0
+        return self.start_anywhere or self.half_heading_deg >= 180.0
 
     @property
     def half_heading_rad(self) -> float:
