@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from benchmarks.recovery_drives import IncidentMaker
-from benchmarks.recovery_trials import Trial, make_incident, run_trial, summary
+from benchmarks.recovery_trials import WATCH_M, Trial, make_incident, run_trial, summary
 from fusion.errors import SkyfixError
 from learned.matcher import load_matcher
 from sequences.drive import load_drive
@@ -54,7 +54,7 @@ def main(
         raise SkyfixError(f"trials: expected >= 1, got {trials}")
     opened = open_sequence(sequence, OpenOptions(seed))
     of = {"kind": kind.value, "sequence": opened.name, "odometry": odometry, "matcher": matcher, "seed": seed}
-    of["scans_simulated"] = opened.scans_simulated
+    of |= {"scans_simulated": opened.scans_simulated, "watch_map_every_m": WATCH_M[kind.value]}
     done = _resumed(out, of)
     maker, loaded = IncidentMaker(load_drive(opened, odometry)), load_matcher(matcher)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
@@ -62,7 +62,7 @@ def main(
         task = bar.add_task(kind.value, total=trials, completed=min(len(done), trials))
         for number in range(len(done), trials):
             incident = make_incident(kind.value, maker, seed, number)
-            settings = TrackSettings("spliced", seed=seed + number, snapshots=0)
+            settings = TrackSettings("spliced", seed=seed + number, snapshots=0, map_check_every_m=WATCH_M[kind.value])
             done.append(run_trial(kind.value, incident, loaded, settings))
             bar.update(task, completed=number + 1)
             _write(out, of, kind.value, done)

@@ -25,6 +25,8 @@ LOST_M = 5.0
 STAY_M = {"kidnap": 10.0, "anywhere": 50.0, "outage": 10.0}
 """It is right again when it has stayed so for so many metres."""
 ALLOWED_M = {"kidnap": 100.0, "anywhere": 300.0, "outage": 30.0}
+WATCH_M = {"kidnap": 4.0, "anywhere": 0.0, "outage": 0.0}
+"""A scan is compared with the whole map every so many metres, as with `skyfix track --watch-map-every`."""
 _JUMP_M = 200.0
 _BEFORE_M, _BLIND_M = 80.0, 300.0
 

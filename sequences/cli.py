@@ -33,6 +33,7 @@ from sequences.cli_options import (
     QuietOption,
     SeedOption,
     StartAnywhereOption,
+    WatchMapOption,
     training_line,
 )
 
@@ -111,6 +112,7 @@ def track(
         float | None,
         typer.Option(help="How far the matcher's errors stay alike, metres. Default: the matcher's own.", metavar="M"),
     ] = None,
+    watch_map_every: WatchMapOption = 0.0,
     map_error_m: Annotated[
         float, typer.Option(help="How far off the map draws things, standard deviation, metres.", metavar="M")
     ] = 0.4,
@@ -139,6 +141,7 @@ def track(
         measure_every_frames=measure_every_frames,
         correlation_length_m=correlation_length_m,
         map_error_m=map_error_m,
+        map_check_every_m=watch_map_every,
     )
     _run(opened, matcher, settings, out, overwrite, quiet, backend)
 

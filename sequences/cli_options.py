@@ -44,6 +44,16 @@ StartAnywhereOption = Annotated[
         help="Nothing is known of the start, not even the heading: it is looked for on the whole map.",
     ),
 ]
+WatchMapOption = Annotated[
+    float,
+    typer.Option(
+        "--watch-map-every",
+        help="Compare a scan with the whole map every so many metres, to notice that the vehicle was carried "
+        "elsewhere; 4 notices it soon. Doubles the cost, and raises false alarms on maps that show little. "
+        "0: never.",
+        metavar="M",
+    ),
+]
 HalfExtentOption = Annotated[
     float, typer.Option(help="The start is known to within a square of this half side, metres.", metavar="M")
 ]

@@ -57,7 +57,8 @@ class TrackSettings:
         The search narrows after so many in a row that do, and widens after so many that do not.
     map_check_every_m
         While the vehicle is tracked, a scan is compared with the whole map every so many metres (see `map_watch`),
-        where the matcher can; 0 for never. It decides on nothing but whether the vehicle is lost.
+        where the matcher can; 0 for never. It decides on nothing but whether the vehicle is lost, and is the only way
+        to notice that it was carried to a place that looks alike; where many places do, it raises false alarms.
     lost_patience
         A vehicle that so many wide searches have not found again is looked for on the whole map.
     relapse_m
@@ -93,7 +94,7 @@ class TrackSettings:
     outlier_probability: float = 0.05
     lost_threshold: float = 0.5
     patience: int = 3
-    map_check_every_m: float = 4.0
+    map_check_every_m: float = 0.0
     lost_patience: int = 3
     relapse_m: float = 50.0
     whole_map_every_m: float = 8.0

@@ -28,7 +28,9 @@ from sequences.run_result import RunResult
 from sequences.search import Phase, SearchPlan
 from sequences.track_settings import TrackSettings
 
-SETTINGS = TrackSettings("spliced", seed=1, particles=1500, snapshots=2, search_max_half_extent_m=12.0)
+SETTINGS = TrackSettings(
+    "spliced", seed=1, particles=1500, snapshots=2, search_max_half_extent_m=12.0, map_check_every_m=4.0
+)
 SIDE, TURN, BINS = 3, 5, 24
 SIGMA = np.array([0.7, 0.7, np.deg2rad(3.0)])
 DECOYS = 3
