@@ -53,7 +53,13 @@ def main(
     if trials < 1:
         raise SkyfixError(f"trials: expected >= 1, got {trials}")
     opened = open_sequence(sequence, OpenOptions(seed))
-    of = {"kind": kind.value, "sequence": opened.name, "odometry": odometry, "matcher": matcher, "seed": seed}
+    of: dict[str, Any] = {
+        "kind": kind.value,
+        "sequence": opened.name,
+        "odometry": odometry,
+        "matcher": matcher,
+        "seed": seed,
+    }
     of |= {"scans_simulated": opened.scans_simulated, "watch_map_every_m": WATCH_M[kind.value]}
     done = _resumed(out, of)
     maker, loaded = IncidentMaker(load_drive(opened, odometry)), load_matcher(matcher)
