@@ -17,7 +17,7 @@ from learned.training import NetworkChoice
 from sequences.osm import Line, MapFeatures, read_osm
 from sequences.train_budget import steps_within
 from sequences.train_command import TrainOptions, train_from_config
-from sequences.train_config import read_config
+from sequences.train_config import TrainConfig, read_config
 from sequences.training_data import SimulatedSamples, SimulationSettings
 
 TINY = """
@@ -138,13 +138,17 @@ def test_overrides_are_typed_and_checked(tiny: Path) -> None:
 
 
 def test_the_shipped_weights_configuration_is_still_one() -> None:
-    """Both stages: scans to 40 m, then to the reach of matching, from the first one's weights."""
+    """Three stages, each from the weights of the one before: near, to the reach of matching, other maps."""
     weights = Path(sequences.__file__).parents[1] / "learned" / "weights"
-    near, far = read_config(weights / "rotmatch_near.yaml"), read_config(weights / "rotmatch.yaml")
+    near, far, last = (read_config(weights / f"rotmatch{stage}.yaml") for stage in ("_near", "_far", ""))
     assert near.training.network == NetworkChoice("rotmatch")
     assert (near.matching_reach_m, near.initial_share) == (72.0, 0.0)
     assert far.training.network.settings.bev.half_extent_m == far.matching_reach_m == 72.0
-    assert far.initial_share == 0.5
+    assert far.initial_share == last.initial_share == 0.5
+    assert last.simulation.overhead_share > 0.0
+    assert last.simulation.drivable_share > 0.0
+    made = TrainConfig.model_validate(json.loads((weights / "rotmatch.json").read_text(encoding="utf-8"))["config"])
+    assert made.model_copy(update={"initial": None}) == last
 
 
 def test_a_cache_is_shared_by_runs_of_one_simulation_alone(tmp_path: Path) -> None:
