@@ -144,7 +144,7 @@ def test_the_shipped_weights_configuration_is_still_one() -> None:
     assert near.training.network == NetworkChoice("rotmatch")
     assert (near.matching_reach_m, near.initial_share) == (72.0, 0.0)
     assert far.training.network.settings.bev.half_extent_m == far.matching_reach_m == 72.0
-    assert far.initial_share == last.initial_share == 0.5
+    assert (far.initial_share, last.initial_share) == (0.5, 0.75)
     assert last.simulation.overhead_share > 0.0
     assert last.simulation.drivable_share > 0.0
     made = TrainConfig.model_validate(json.loads((weights / "rotmatch.json").read_text(encoding="utf-8"))["config"])
