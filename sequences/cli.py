@@ -20,6 +20,8 @@ from fusion.errors import SkyfixError
 from sequences.cli_ablate import ablate
 from sequences.cli_options import (
     BackendOption,
+    CacheOption,
+    ExtractsOption,
     HalfExtentOption,
     HalfHeadingOption,
     HalfHeadingsOption,
@@ -225,7 +227,7 @@ def convert(
 )
 def train(
     config: Annotated[Path, typer.Argument(help="YAML file with the training's settings.", metavar="CONFIG")],
-    data: Annotated[Path, typer.Option(help="Folder of the OpenStreetMap extracts.", metavar="DIR")] = Path(),
+    data: ExtractsOption = Path(),
     out: Annotated[Path, typer.Option(help="Gets the checkpoint, the loss curve and the cache.", metavar="DIR")] = Path(
         "runs/training"
     ),
@@ -242,13 +244,7 @@ def train(
             metavar="M",
         ),
     ] = None,
-    cache: Annotated[
-        Path | None,
-        typer.Option(
-            help="Keep the simulated samples here, for other runs of the same simulation too. Default: OUT/cache.",
-            metavar="DIR",
-        ),
-    ] = None,
+    cache: CacheOption = None,
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Also write the losses as TensorBoard event files into OUT.")
     ] = False,

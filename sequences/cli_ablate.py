@@ -9,14 +9,21 @@ from typing import Annotated
 import typer
 
 from fusion.errors import SkyfixError
-from sequences.cli_options import HalfExtentOption, HalfHeadingsOption, MaxFramesOption, training_line
+from sequences.cli_options import (
+    CacheOption,
+    ExtractsOption,
+    HalfExtentOption,
+    HalfHeadingsOption,
+    MaxFramesOption,
+    training_line,
+)
 
 
 def ablate(
     config: Annotated[
         Path, typer.Argument(help="YAML file with a base configuration and its variants.", metavar="CONFIG")
     ],
-    data: Annotated[Path, typer.Option(help="Folder of the OpenStreetMap extracts.", metavar="DIR")] = Path(),
+    data: ExtractsOption = Path(),
     out: Annotated[Path, typer.Option(help="Gets the tables and every run.", metavar="DIR")] = Path("runs/ablation"),
     minutes: Annotated[
         float | None,
@@ -41,13 +48,7 @@ def ablate(
             "--set", help="Replace a setting of the base, for all variants; may be repeated.", metavar="KEY=VALUE"
         ),
     ] = None,
-    cache: Annotated[
-        Path | None,
-        typer.Option(
-            help="Keep the simulated samples here, for other runs of the same simulation too. Default: OUT/cache.",
-            metavar="DIR",
-        ),
-    ] = None,
+    cache: CacheOption = None,
     half_extent: HalfExtentOption = 20.0,
     half_heading_deg: HalfHeadingsOption = None,
     max_frames: MaxFramesOption = 200,

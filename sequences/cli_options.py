@@ -37,6 +37,14 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")
 HeadingUnknownOption = Annotated[
     bool, typer.Option("--heading-unknown", help="The start's heading may be anything, as with --half-heading-deg 180.")
 ]
+ExtractsOption = Annotated[Path, typer.Option(help="Folder of the OpenStreetMap extracts.", metavar="DIR")]
+CacheOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Keep the simulated samples here, for other runs of the same simulation too. Default: OUT/cache.",
+        metavar="DIR",
+    ),
+]
 StartAnywhereOption = Annotated[
     bool,
     typer.Option(

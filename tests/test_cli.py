@@ -143,6 +143,7 @@ def test_every_option_of_track_reaches_the_settings(
         "--correlation-length-m": "11",
         "--map-error-m": "0.25",
         "--particles": "1234",
+        "--watch-map-every": "6",
     }
     words = [word for option, value in options.items() for word in (option, *value.split())]
     out = ("--out", str(tmp_path / "out"))
@@ -159,8 +160,11 @@ def test_every_option_of_track_reaches_the_settings(
             measure_every_frames=3,
             correlation_length_m=11.0,
             map_error_m=0.25,
+            map_check_every_m=6.0,
         )
     ]
+    assert skyfix(capsys, monkeypatch, "track", str(made_drive.path), *out, "--start-anywhere").code == 2
+    assert seen[1:] == [TrackSettings(odometry="wheels", start_anywhere=True)]
 
 
 def test_view_prints_the_same_table_again(

@@ -12,6 +12,7 @@ from safetensors.torch import load_file
 
 import sequences.train_budget
 from fusion.errors import SkyfixError
+from learned.map_raster import CLASSES
 from learned.matcher import load_matcher
 from learned.training import NetworkChoice
 from sequences.osm import Line, MapFeatures, read_osm
@@ -115,6 +116,25 @@ def test_minutes_become_steps_once(tiny: Path, tmp_path: Path, monkeypatch: pyte
         steps_within(0.0, sources[0], sources[1], settings)
     with pytest.raises(SkyfixError, match=r"expected at least 0\.1 for a single step, got 0\.01"):
         steps_within(0.01, sources[0], sources[1], settings)
+
+
+@pytest.mark.parametrize(
+    ("overhead", "drivable", "shown"),
+    [(0.0, 0.0, {"building", "road", "path"}), (1.0, 0.0, {"building", "road", "forest"}), (1.0, 1.0, {"road"})],
+)
+def test_samples_show_the_kind_of_map_asked_for(
+    tiny: Path, tmp_path: Path, overhead: float, drivable: float, shown: set[str]
+) -> None:
+    with resources.as_file(resources.files("pyrosm") / "data" / "test.osm.pbf") as path:
+        extracts = [(read_osm(path), 1.0)]
+    how = replace(read_config(tiny).simulation, overhead_share=overhead, drivable_share=drivable)
+    source = SimulatedSamples(extracts, how, tmp_path / "cache")
+    seen = {CLASSES[index] for area in range(2) for sample in source.area(area) for index in np.unique(sample.classes)}
+    assert shown <= seen
+    thin = {"wall", "fence", "hedge", "path", "tree"}
+    assert bool(seen & thin) == (overhead == 0.0)
+    if drivable:
+        assert seen == {"void", "road"}
 
 
 def test_overrides_are_typed_and_checked(tiny: Path) -> None:

@@ -31,11 +31,6 @@ def cut_normal_quantile(share: FloatArray, sigma: FloatArray, half: FloatArray) 
     return np.where(np.isinf(sigma), uniform, np.clip(normal, -half, half))
 
 
-def _kept(sigmas: FloatArray, halves: FloatArray) -> FloatArray:
-    """Mass of normal distributions inside of +-`halves`; of uniform ones not zero."""
-    return np.maximum(1.0 - 2.0 * ndtr(-halves / sigmas), np.finfo(np.float64).tiny)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class EmulatedLikelihood:
     """Weighted Gaussians with axes of their own, each cut off at a box; fits the protocol `PoseLikelihood`.
