@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from fusion import (
     GaussianMixture,
@@ -281,3 +282,18 @@ def test_bad_input_is_refused():
         with pytest.raises(SkyfixError, match=word) as caught:
             call()
         assert "\n" not in str(caught.value)
+
+
+def test_evidence_of_one_pose_is_that_of_the_prior_and_the_measurement() -> None:
+    """ln N(mean; prior mean, P + S), up to a constant of the graph: its differences between measurements."""
+    prior = UniformPrior(np.array([3.0, -2.0, 0.3]), 2.0, 0.05)
+    initial = Trajectory(np.array([0]), prior.mean[None], prior.covariance[None])
+    found, exact = [], []
+    for sigma, off in ((0.3, 0.0), (1.0, 0.5), (3.0, -1.0)):
+        mean = prior.mean + [off, 0.5 * off, 0.01 * off]
+        covariance = np.diag([sigma, 0.5 * sigma, 0.02 * sigma]) ** 2
+        seen = GaussianMixture(np.ones(1), mean[None], covariance[None])
+        settings = SmootherSettings(outlier_probability=1e-9)
+        found.append(smooth(np.array([0]), [], [seen], prior, initial, settings).log_evidence)
+        exact.append(float(multivariate_normal(prior.mean, prior.covariance + covariance).logpdf(mean)))
+    np.testing.assert_allclose(np.diff(found), np.diff(exact), atol=1e-3)
