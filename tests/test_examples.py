@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import runpy
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -32,3 +33,17 @@ def test_a_gtsam_graph_of_ones_own_takes_whole_likelihoods(capsys: pytest.Captur
     odometry, on_map = (float(value) for value in found.groups())
     assert on_map < 0.5
     assert on_map < 0.3 * odometry
+
+
+def test_kiss_icp_is_held_to_the_map(
+    shared_data: Callable[[str], Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("kiss_icp")
+    monkeypatch.setattr("sys.argv", ["kiss_icp_tracking.py", str(shared_data("kitti_raw_0013_start"))])
+    runpy.run_path(str(EXAMPLES / "kiss_icp_tracking.py"), run_name="__main__")
+    said = r"10 of 40 scans measured: tracker ends ([\d.]+) m off, KISS-ICP alone ([\d.]+) m"
+    found = re.search(said, capsys.readouterr().out)
+    assert found is not None
+    tracker, alone = (float(value) for value in found.groups())
+    assert tracker < 1.0
+    assert alone > 5.0
