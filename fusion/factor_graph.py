@@ -136,10 +136,12 @@ def smooth(
         (_from(start, stamps[kept], graphs, among, settings.max_iterations) for start in starts),
         key=lambda one: one.log_evidence,
     )
-    poses = chain.filled(kept, found.solution.poses)
-    every = np.arange(len(stamps))
-    whole = graphs[-1] if len(kept) == len(every) else pose_graph(chain, prior, settings, native_factors(others, every))
-    last = _solved(whole, poses, seen.nodes, found.sites)
+    if len(kept) == len(stamps):
+        last = _solved(graphs[-1], found.solution, seen.nodes, found.sites)
+    else:
+        whole = pose_graph(chain, prior, settings, native_factors(others, np.arange(len(stamps))))
+        filled = whole.at(chain.filled(kept, found.solution.poses), seen.nodes, found.sites)
+        last = _solved(whole, filled, seen.nodes, found.sites)
     assert last.covariances is not None  # the last step gives them
     assert last.calibration_covariances is not None
     chosen = np.full(len(stamps), NOT_MEASURED, dtype=np.int64)
@@ -167,9 +169,8 @@ def _from(
     return propagate(graphs[-1], measurements, poses, covariances, max_rounds)
 
 
-def _solved(graph: PoseGraph, poses: FloatArray, nodes: IntArray, sites: Sites) -> Solution:
+def _solved(graph: PoseGraph, solution: Solution, nodes: IntArray, sites: Sites) -> Solution:
     """Steps to the end with the sites as they are."""
-    solution = graph.at(poses, nodes, sites)
     for _ in range(_MOST_LAST_STEPS):
         before = solution.poses
         solution = graph.step(solution, nodes, sites, marginals=False)

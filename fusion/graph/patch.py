@@ -80,8 +80,8 @@ class LikelihoodPatch:
     @property
     def first_centre(self) -> tuple[float, float, float]:
         """x, y and yaw of the centre of the first cell."""
-        x, y = self.grid.xy_from_pixel((0.5, 0.5)).tolist()
-        return x, y, self.first_bin * se2.TWO_PI / self.bin_count
+        grid, half = self.grid, 0.5 * self.grid.metres_per_pixel
+        return grid.x0 + half, grid.y0 + grid.height_m - half, self.first_bin * se2.TWO_PI / self.bin_count
 
 
 def patch_of(likelihood: PoseLikelihood | LikelihoodPatch, around: Neighbourhood | None = None) -> LikelihoodPatch:

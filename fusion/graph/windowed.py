@@ -6,6 +6,7 @@ import numpy as np
 
 from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
+from fusion.graph.covariances import raised
 
 _LEAST_VARIANCE = 1e-12
 
@@ -42,11 +43,8 @@ class Windowed:
         measurement. Where the measurement is wider than any Gaussian (two modes in the window), the precision is 0
         along that direction: it is positive semidefinite by construction.
         """
-        values, vectors = np.linalg.eigh(self.spreads)
-        within = (vectors / np.maximum(values, _LEAST_VARIANCE)[:, None, :]) @ vectors.swapaxes(1, 2)
-        excess = within - _diagonal(1.0 / self.flat)
-        gained, axes = np.linalg.eigh(0.5 * (excess + excess.swapaxes(1, 2)))
-        precision = (axes * np.maximum(gained, 0.0)[:, None, :]) @ axes.swapaxes(1, 2)
+        within = np.linalg.inv(raised(self.spreads, _LEAST_VARIANCE))
+        precision = raised(within - _diagonal(1.0 / self.flat), 0.0)
         information = np.einsum("mij,mj->mi", precision, self.means) + self.means / self.flat
         inverse = np.linalg.inv(self.roots)
         across = inverse.swapaxes(1, 2)
