@@ -24,6 +24,7 @@ from fusion.emulation.likelihood_emulator import EmulatorSettings, LikelihoodEmu
 from fusion.error_memory import ErrorMemory
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
+from fusion.gaussian_mixture import GaussianMixture
 from fusion.odometry import OdometryNoise, increments_at
 from fusion.odometry_calibration import OdometryCalibration
 from fusion.particle_filter import ParticleFilter
@@ -32,6 +33,7 @@ from fusion.particles.cloud_history import CloudHistory
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 from sequences.metrics import summarise
+from sequences.offline import smooth_drive
 from sequences.start import offset_in_box
 
 _START_STREAM, _PRIOR_STREAM, _FILTER_STREAM, _MEASURE_STREAM, _SMOOTHER_STREAM = range(5)
@@ -103,19 +105,21 @@ class EmulatedRun:
     ----------
     name
         Of the profile; it says 'emulated'.
-    filter, smoother
-        Estimates at all stamps, with covariances.
+    filter, smoother, graph
+        Estimates at all stamps, with covariances: of the particle filter, of paths drawn backward through its clouds,
+        and of the factor graph, which gets every measurement as a mixture and finds the odometry's errors by itself.
     single_shot
         The measurements' own answers.
     measured
         (K,) frames with a measurement.
     metrics
-        `metrics.summarise` by method: prior, odometry, single_shot, filter, smoother.
+        `metrics.summarise` by method: prior, odometry, single_shot, filter, smoother, graph.
     """
 
     name: str
     filter: Trajectory
     smoother: Trajectory
+    graph: Trajectory
     single_shot: Trajectory
     measured: IntArray
     metrics: dict[str, dict[str, Any]]
@@ -169,6 +173,7 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
     history = CloudHistory(settings.kept_particles, settings.seed)
     estimates: list[Estimate] = []
     answers: dict[int, FloatArray] = {}
+    mixtures: list[GaussianMixture | None] = []
     since_m, memory = np.inf, ErrorMemory()
     for frame, stamp in enumerate(stamps.tolist()):
         if frame:
@@ -178,11 +183,14 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
             since_m += float(np.hypot(*increment.delta[:2]))
         if since_m >= settings.measure_every_m:
             likelihood = emulator.measure(poses[frame], since_m)
-            memory = _weigh(particles, likelihood, settings.correlation(since_m), memory)
+            temperature, memory = _weigh(particles, likelihood, settings.correlation(since_m), memory)
+            mixtures.append(likelihood.modes(len(likelihood.weights)).tempered(temperature))
             answers[frame], since_m = likelihood.answer, 0.0
             history.record(particles, stamp)
-        elif frame == len(stamps) - 1:
-            history.record(particles, stamp)
+        else:
+            mixtures.append(None)
+            if frame == len(stamps) - 1:
+                history.record(particles, stamp)
         estimates.append(particles.estimate(stamp))
     smoothed = sample_paths(history, np.random.default_rng([settings.seed, _SMOOTHER_STREAM]), settings.smoother)
     measured = np.array(list(answers), dtype=np.int64)
@@ -193,24 +201,26 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
     offsets = offset_in_box(*box, np.random.default_rng([settings.seed, _PRIOR_STREAM]), len(truth))
     placed = _placed(np.array([increment.delta for increment in increments]), start)
     smoother = smoothed.trajectory()
+    graph = smooth_drive(stamps, moved, settings.noise, mixtures, prior, filtered)[0].trajectory
     metrics = {
         "prior": summarise(poses, poses + offsets),
         "odometry": summarise(poses, placed),
         "single_shot": summarise(poses[measured], single_shot.poses),
         "filter": summarise(poses, filtered.poses, filtered.covariances),
         "smoother": summarise(poses, smoother.poses, smoother.covariances),
+        "graph": summarise(poses, graph.poses, graph.covariances),
     }
-    return EmulatedRun(profile.name, filtered, smoother, single_shot, measured, metrics)
+    return EmulatedRun(profile.name, filtered, smoother, graph, single_shot, measured, metrics)
 
 
 def _weigh(
     particles: ParticleFilter, likelihood: EmulatedLikelihood, correlation: float, memory: ErrorMemory
-) -> ErrorMemory:
-    """Weigh by a measurement, flattened for what it repeats of the last one's error."""
+) -> tuple[float, ErrorMemory]:
+    """Weigh by a measurement, flattened for what it repeats of the last one's error; by how much, and what is next."""
     before = particles.estimate(0).covariance
     temperature = memory.temperature(correlation, before)
     particles.update(likelihood, temperature)
-    return memory.after(correlation, temperature, before, particles.estimate(0).covariance)
+    return temperature, memory.after(correlation, temperature, before, particles.estimate(0).covariance)
 
 
 def _placed(deltas: FloatArray, start: FloatArray) -> FloatArray:

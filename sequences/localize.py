@@ -13,14 +13,14 @@ from typing import Protocol
 
 import numpy as np
 
-from fusion.factor_graph import OdometryDrift, SmootherSettings, smooth
+from fusion.factor_graph import SmootherSettings
 from fusion.odometry import increments_at
-from fusion.odometry_calibration import calibrate_odometry
 from fusion.trajectory import Trajectory
 from learned.matcher import MapMatcher
 from sequences.drive import Drive, load_drive, place_odometry
 from sequences.filter_pass import FilterPass
 from sequences.metrics import position_errors
+from sequences.offline import smooth_drive
 from sequences.run_metrics import run_metrics
 from sequences.run_result import FrameRow, RunResult, Snapshot
 from sequences.sequence import Sequence
@@ -81,22 +81,17 @@ def track(
         "map",
     )
     begin = time.perf_counter()
-    smoother_settings = SmootherSettings(outlier_probability=settings.outlier_probability)
-    odometry = sequence.odometry(settings.odometry)
-    measured = sorted(online.best)
-    calibration = calibrate_odometry(
-        drive.stamps_ns[measured],
-        odometry,
+    smoothed, calibration = smooth_drive(
+        drive.stamps_ns,
+        sequence.odometry(settings.odometry),
         settings.noise,
-        [patch for patch in online.patches if patch is not None],
+        online.patches,
         prior,
         filtered,
-        smoother_settings,
+        SmootherSettings(outlier_probability=settings.outlier_probability),
     )
-    motions = increments_at(drive.stamps_ns, calibration.corrected(odometry), calibration.noise(settings.noise))
-    drifting = replace(smoother_settings, drift=calibration.drift(OdometryDrift()))
-    smoothed = smooth(drive.stamps_ns, motions, online.patches, prior, filtered, drifting)
     smoothing_s = time.perf_counter() - begin
+    measured = sorted(online.best)
     result = RunResult(
         sequence_name=sequence.name,
         matcher_name=matcher.name,

@@ -36,9 +36,10 @@ def test_fusing_emulated_measurements_beats_them_and_the_odometry() -> None:
     settings = EmulatedRunSettings(particles=600, kept_particles=600, smoother=QUICK)
     run = run_emulated(truth, emulate_odometry(truth, 1), settings)
     mean = {name: row["position_error_m"]["mean"] for name, row in run.metrics.items()}
-    assert list(mean) == ["prior", "odometry", "single_shot", "filter", "smoother"]
+    assert list(mean) == ["prior", "odometry", "single_shot", "filter", "smoother", "graph"]
     assert 2.0 * mean["filter"] < min(mean["single_shot"], mean["odometry"], mean["prior"])
     assert mean["smoother"] < mean["filter"]
+    assert mean["graph"] < mean["filter"]
     assert len(run.measured) == pytest.approx(100, abs=3)
     np.testing.assert_array_equal(run.smoother.stamp_ns, truth.stamp_ns)
     assert run.table().startswith("emulated TransLocNet")
@@ -89,3 +90,5 @@ def test_a_kilometre_of_real_odometry(shared_data: Callable[[str], Path]) -> Non
     assert metrics["filter"]["position_error_m"]["mean"] < 2.5
     assert metrics["smoother"]["position_error_m"]["mean"] < 1.4
     assert 0.4 < metrics["smoother"]["nees"]["mean"] / 3 < 1.6
+    assert metrics["graph"]["position_error_m"]["mean"] < 1.0
+    assert 0.4 < metrics["graph"]["nees"]["mean"] / 3 < 1.6
