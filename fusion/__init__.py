@@ -16,6 +16,7 @@ from fusion.error_correlation import ErrorCorrelation, estimate_error_correlatio
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.factor_graph import AbsoluteFix, LoopClosure, OdometryDrift, SmootherResult, SmootherSettings, smooth
+from fusion.fixed_lag import FixedLagSettings, FixedLagSmoother, LagCounts, LagReport, LagState
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.graph.likelihood_factors import LikelihoodFactors
@@ -55,6 +56,8 @@ __all__ = [
     "ErrorCorrelation",
     "ErrorProfile",
     "Estimate",
+    "FixedLagSettings",
+    "FixedLagSmoother",
     "GaussianLikelihood",
     "GaussianMixture",
     "GridFilter",
@@ -63,6 +66,9 @@ __all__ = [
     "KalmanFilter",
     "KalmanFilterSettings",
     "KldSampling",
+    "LagCounts",
+    "LagReport",
+    "LagState",
     "LazyOrientation",
     "LikelihoodEmulator",
     "LikelihoodFactors",
