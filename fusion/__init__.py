@@ -24,6 +24,7 @@ from fusion.grid import MapGrid
 from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
 from fusion.grids.pose_lattice import PoseLattice
+from fusion.hypotheses import Hypothesis, HypothesisSettings, HypothesisSmoother, HypothesisState
 from fusion.kalman_filter import KalmanFilter, KalmanFilterSettings
 from fusion.lazy_orientation import LazyOrientation
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
@@ -63,6 +64,10 @@ __all__ = [
     "GridFilter",
     "GridFilterSettings",
     "GridSmootherResult",
+    "Hypothesis",
+    "HypothesisSettings",
+    "HypothesisSmoother",
+    "HypothesisState",
     "KalmanFilter",
     "KalmanFilterSettings",
     "KldSampling",

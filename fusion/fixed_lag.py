@@ -31,11 +31,12 @@ from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
+from fusion.graph.basins import around
 from fusion.graph.lag_rounds import refreshed, seen_at
 from fusion.graph.lag_settings import FixedLagSettings
 from fusion.graph.lag_window import KeptMeasurement, LagWindow, first_window
 from fusion.graph.measurements import Measurement
-from fusion.graph.patch import LikelihoodPatch, Neighbourhood, patch_of
+from fusion.graph.patch import LikelihoodPatch, patch_of
 from fusion.graph.sites import Sites
 from fusion.odometry import OdometryIncrement
 from fusion.prior import UniformPrior
@@ -44,9 +45,6 @@ from fusion.tracking.tracker_report import Outcome
 from fusion.trajectory import Trajectory
 
 __all__ = ["FixedLagSettings", "FixedLagSmoother", "LagCounts", "LagReport", "LagState"]
-
-_REACH = 6.0  # standard deviations around the prediction within which a likelihood is kept
-_MARGIN_M, _MARGIN_RAD = 6.0, 0.35  # and beyond, for a prediction that was wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +139,13 @@ class FixedLagSmoother:
         """A smoother that begins with the mean and covariance of a prior's box."""
         return cls(stamp_ns, prior.mean, prior.covariance, settings)
 
+    @classmethod
+    def from_state(cls, state: LagState, settings: FixedLagSettings | None = None) -> Self:
+        """A smoother that goes on from a state."""
+        smoother = cls(0, np.zeros(3), np.eye(3), settings)
+        smoother.restore(state)
+        return smoother
+
     def __len__(self) -> int:
         """Number of poses held."""
         return len(self._state.window)
@@ -168,6 +173,12 @@ class FixedLagSmoother:
     def restore(self, state: LagState) -> None:
         """Go back to a state."""
         self._state = state
+
+    def prediction(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Pose (3,) and covariance (3, 3) at the pose held that is nearest after a stamp, the newest at most."""
+        window = self._state.window
+        place = min(int(np.searchsorted(window.stamps, stamp_ns)), len(window) - 1)
+        return window.poses[place], window.covariances[place]
 
     def add_odometry(self, increment: OdometryIncrement) -> LagReport:
         """Add a pose by the motion from the newest.
@@ -282,12 +293,8 @@ class FixedLagSmoother:
 
 
 def _kept(likelihood: Measurement, pose: FloatArray, covariance: FloatArray) -> KeptMeasurement:
-    """The part of a likelihood around a prediction that can matter."""
     if isinstance(likelihood, GaussianLikelihood):
         return likelihood.modes(1)
     if isinstance(likelihood, (GaussianMixture, LikelihoodPatch)):
         return likelihood
-    sigma = np.sqrt(np.diagonal(covariance))
-    half_heading = min(np.pi, _REACH * float(sigma[2]) + _MARGIN_RAD)
-    around = Neighbourhood(pose, _REACH * float(sigma[:2].max()) + _MARGIN_M, half_heading)
-    return patch_of(likelihood, around)
+    return patch_of(likelihood, around(pose, covariance))

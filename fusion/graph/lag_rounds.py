@@ -9,16 +9,20 @@ forgotten.
 Source: Minka, "Expectation propagation for approximate Bayesian inference", UAI 2001.
 """
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.arrays import FloatArray, IntArray
+from fusion.graph.chain_algebra import OPTIONS, invert, product, wrap
 from fusion.graph.lag_window import LagWindow
 from fusion.graph.measurements import Measurements
 from fusion.graph.sites import Sites, deviations
 from fusion.graph.windowed import Windowed
 
 _DAMPING = 0.85
-_STALE = 0.05  # change of a cavity, in its standard deviations and as a share of its covariance
+_LEAST_DETERMINANT = 1e-9
+_STALE = 0.1  # change of a cavity, in its standard deviations and as a share of its covariance
 
 
 def seen_at(
@@ -36,13 +40,24 @@ def seen_at(
 def refreshed(window: LagWindow, most: int, outlier: float, clutter: float) -> tuple[LagWindow, int]:
     """A window with at most `most` stale sites found anew, and how many they were."""
     places = window.measured
-    centres, widths = window.sites(places).cavities(window.poses[places], window.covariances[places])
-    stale = _change(window.centres[places], window.widths[places], centres, widths)
+    stale = np.empty(len(places))
+    _staleness(
+        places,
+        window.poses,
+        window.covariances,
+        window.references,
+        window.precisions,
+        window.informations,
+        window.centres,
+        window.widths,
+        stale,
+    )
     chosen = np.argsort(-stale, kind="stable")[:most]
     chosen = np.sort(chosen[stale[chosen] > _STALE])
     if len(chosen) == 0:
         return window, 0
-    places, centres, widths = places[chosen], centres[chosen], widths[chosen]
+    places = places[chosen]
+    centres, widths = window.sites(places).cavities(window.poses[places], window.covariances[places])
     fresh = Sites(centres, *seen_at(window, places, centres, widths, outlier, clutter).factors())
     off = deviations(centres, window.centres[places])
     return window.with_sites(
@@ -53,9 +68,49 @@ def refreshed(window: LagWindow, most: int, outlier: float, clutter: float) -> t
     ), len(chosen)
 
 
-def _change(centres: FloatArray, widths: FloatArray, new_centres: FloatArray, new_widths: FloatArray) -> FloatArray:
-    """How far cavities (M, 3), (M, 3, 3) have moved, in units of the new ones."""
-    inverse = np.linalg.inv(np.linalg.cholesky(new_widths))
-    off = np.einsum("mij,mj->mi", inverse, deviations(new_centres, centres))
-    shape = inverse @ widths @ inverse.swapaxes(1, 2) - np.eye(3)
-    return np.asarray(np.maximum(np.abs(off).max(axis=1), np.abs(shape).max(axis=(1, 2))))
+@numba.njit(**OPTIONS)
+def _staleness(
+    places: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    references: NDArray[np.float64],
+    precisions: NDArray[np.float64],
+    informations: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    stale: NDArray[np.float64],
+) -> None:
+    """How far the cavities at places have moved, in units of themselves; infinity where that cannot be told cheaply."""
+    rest, shrunk, cavity, inverse = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    vector, off = np.empty(3), np.empty(3)
+    for m in range(len(places)):
+        k = places[m]
+        product(covariances[k], precisions[k], rest)
+        for i in range(3):
+            for j in range(3):
+                rest[i, j] = (1.0 if i == j else 0.0) - rest[i, j]
+        if not np.linalg.det(rest) > _LEAST_DETERMINANT:
+            stale[m] = np.inf
+            continue
+        invert(rest, shrunk)
+        product(shrunk, covariances[k], cavity)
+        invert(cavity, inverse)
+        for i in range(3):
+            off[i] = references[k, i] - poses[k, i]
+        off[2] = wrap(off[2])
+        for i in range(3):
+            vector[i] = informations[k, i]
+            for j in range(3):
+                vector[i] += precisions[k, i, j] * off[j]
+        for i in range(3):
+            off[i] = poses[k, i] - centres[k, i]
+            for j in range(3):
+                off[i] -= cavity[i, j] * vector[j]
+        off[2] = wrap(off[2])
+        moved, shape = 0.0, 0.0
+        for i in range(3):
+            for j in range(3):
+                moved += off[i] * inverse[i, j] * off[j]
+                scale = np.sqrt(abs(cavity[i, i] * cavity[j, j]))
+                shape = max(shape, abs(cavity[i, j] - widths[k, i, j]) / scale)
+        stale[m] = max(np.sqrt(max(moved, 0.0)), shape)
