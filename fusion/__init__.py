@@ -20,6 +20,7 @@ from fusion.fixed_lag import FixedLagSettings, FixedLagSmoother, LagCounts, LagR
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.graph.likelihood_factors import LikelihoodFactors
+from fusion.graph_filter import FilterAndGraph, GraphFilter
 from fusion.grid import MapGrid
 from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
@@ -57,10 +58,12 @@ __all__ = [
     "ErrorCorrelation",
     "ErrorProfile",
     "Estimate",
+    "FilterAndGraph",
     "FixedLagSettings",
     "FixedLagSmoother",
     "GaussianLikelihood",
     "GaussianMixture",
+    "GraphFilter",
     "GridFilter",
     "GridFilterSettings",
     "GridSmootherResult",

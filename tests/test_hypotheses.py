@@ -87,8 +87,9 @@ def test_names_do_not_matter():
 
 
 def test_a_wide_hypothesis_does_not_take_the_other_streets_mass():
-    """One that is so wide that its window reaches the other street stays on its own, where the other one is known."""
-    covariances = np.array([np.diag([3.0, 9.0, 0.05]) ** 2, START])
+    """One so wide that its window reaches the other street, where another one is known: each has its own street, and
+    the weights are those of the prior's densities there, in closed form."""
+    covariances = np.array([np.diag([2.0, 14.0, 0.05]) ** 2, START])
     means = np.array([[0.0, STREETS[0], 0.0], [0.0, STREETS[1], 0.0]])
     tracker = HypothesisSmoother(0, GaussianMixture(np.array([0.5, 0.5]), means, covariances))
     driven(tracker, 4, 0, undecided=6, told=0)
@@ -96,6 +97,8 @@ def test_a_wide_hypothesis_does_not_take_the_other_streets_mass():
     assert abs(lower.pose[1] - STREETS[0]) < 1.5
     assert abs(upper.pose[1] - STREETS[1]) < 1.5
     assert np.sqrt(lower.covariance[1, 1]) < 1.0
+    heights = 1.0 / np.hypot([14.0, 2.0], 1.2)
+    np.testing.assert_allclose(tracker.weights, heights / heights.sum(), atol=0.03)
 
 
 def test_hypotheses_that_see_the_same_mass_become_one():
