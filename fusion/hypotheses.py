@@ -61,7 +61,7 @@ class HypothesisSettings:
 
     least_share: float = 1e-4
     merge_distance: float = 0.5
-    apart_distance: float = 1.0
+    apart_distance: float = 2.0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.least_share < 1.0:

@@ -34,7 +34,7 @@ class FixedLagSettings:
 
     lag: int = 100
     rounds: int = 1
-    refreshes: int = 16
+    refreshes: int = 8
     outlier_probability: float = 0.05
     clutter_log_density: float = -9.2
     huber_width: float = 4.0

@@ -20,7 +20,7 @@ from fusion.odometry import OdometryIncrement
 KeptMeasurement = GaussianMixture | LikelihoodPatch
 
 _MOST_STEPS = 6
-_TOLERANCE = 1e-5  # metres and radians; what is left is quadratic in it
+_TOLERANCE = 1e-4  # metres and radians; what is left is quadratic in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
