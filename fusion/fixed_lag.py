@@ -218,7 +218,7 @@ class FixedLagSmoother:
             finite comes of it; the smoother is then as it was.
         """
         stamp_ns = checked_stamp(stamp_ns)
-        if not isinstance(likelihood, (GaussianMixture, LikelihoodPatch)):
+        if not isinstance(likelihood, (GaussianLikelihood, GaussianMixture, LikelihoodPatch)):
             check_likelihood(likelihood)
         window, settings = self._state.window, self.settings
         if stamp_ns > window.stamps[-1]:

@@ -241,8 +241,10 @@ def test_command_prints_a_table_and_writes_the_rows(
     [
         (
             ["nonsense"],
-            "benchmark: expected one of filter_step, fixed_lag, grid_filter, inference, smoother, translocnet, "
-            "got 'nonsense'",
+            (
+                "benchmark: expected one of filter_step, fixed_lag, grid_filter, inference, smoother, translocnet, "
+                "got 'nonsense'"
+            ),
         ),
         (["smoother", "--runs", "0"], "runs: expected >= 1, got 0"),
     ],

@@ -1,5 +1,7 @@
 """The graph as a tracker's estimator: as the smoother, late as in time, saved and resumed, with a filter beside it."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from made_streams import (
@@ -35,6 +37,7 @@ from fusion import (
     se2,
 )
 from fusion.tracking.archive import read_archive, write_archive
+from fusion.tracking.state_tree import state_tree, state_values
 
 PRIOR = UniformPrior(np.zeros(3), 5.0, 0.3)
 SETTINGS = TrackerSettings(history_s=1.0, correlation_length_m=7.0)
@@ -187,3 +190,17 @@ def test_several_starts_are_several_hypotheses():
     assert len(graph.estimate(0, max_modes=4).modes) == 2
     graph.update(GaussianLikelihood(means[1], np.diag(SIGMA**2), GRID))
     assert graph.estimate(0, max_modes=4).modes.weights[0] > 0.9
+
+
+def test_states_of_unknown_types_are_not_written():
+    @dataclass(frozen=True)
+    class Inner:
+        number: int
+
+    @dataclass(frozen=True)
+    class State:
+        inner: Inner
+
+    with pytest.raises(SkyfixError, match="Inner"):
+        state_tree(State(Inner(1)))
+    assert state_values(state_tree(State((1, "two", None)))) == {"inner": (1, "two", None)}
