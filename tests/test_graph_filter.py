@@ -164,11 +164,16 @@ def test_a_graph_that_the_filter_leaves_begins_anew():
 
 
 def test_bad_input_is_refused_and_changes_nothing():
-    class Broken(GaussianLikelihood):
+    class Broken:
+        grid, searched_volume = GRID, GRID.area_m2
+
         def log_density(self, poses):
             return np.full(len(poses), np.inf)
 
         def tempered(self, temperature):
+            return self
+
+        def with_outliers(self, probability):
             return self
 
     for pair in (both(np.zeros(3)), GraphFilter.from_prior(PRIOR)):
@@ -177,7 +182,7 @@ def test_bad_input_is_refused_and_changes_nothing():
         pair.predict(STEP)
         before = pair.estimate(0)
         with pytest.raises(SkyfixError, match="likelihood") as caught:
-            pair.update(Broken(np.zeros(3), np.eye(3), GRID))
+            pair.update(Broken())
         assert "\n" not in str(caught.value)
         np.testing.assert_array_equal(pair.estimate(0).pose, before.pose)
     with pytest.raises(SkyfixError, match="estimator"):
