@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from benchmarks import filter_step, grid_filter, inference, smoother, translocnet
+from benchmarks import filter_step, fixed_lag, grid_filter, inference, smoother, translocnet
 from benchmarks.runner import Case, Row, time_case
 from fusion.errors import SkyfixError
 
 BENCHMARKS: dict[str, Callable[[], Iterator[Case]]] = {
     "filter_step": filter_step.cases,
+    "fixed_lag": fixed_lag.cases,
     "grid_filter": grid_filter.cases,
     "inference": inference.cases,
     "smoother": smoother.cases,

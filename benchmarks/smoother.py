@@ -89,17 +89,19 @@ def skyfix_whole(drive: Drive, patches: Sequence[LikelihoodPatch]) -> SmootherRe
 
 
 def whole_likelihoods(drive: Drive) -> list[LikelihoodPatch]:
-    """The Gaussians on grids of 1 m and 1 degree, 10 m and 12 degrees around."""
-    patches = []
-    for mixture in drive.measurements:
-        corner, first = np.floor(mixture.means[0, :2]) - 10.0, round(float(np.rad2deg(mixture.means[0, 2]))) - 12
-        grid = MapGrid(21, 21, 1.0, *corner.tolist())
-        x, y = grid.centres()
-        yaw = np.deg2rad(first + np.arange(25.0))
-        poses = np.stack(np.meshgrid(y, x, yaw, indexing="ij"), axis=-1)[..., [1, 0, 2]]
-        values = np.maximum(mixture.log_density(poses.reshape(-1, 3)), _FLOOR).reshape(poses.shape[:3])
-        patches.append(LikelihoodPatch(values.astype(np.float32), grid, first, 360, _FLOOR, log_uniform_density(grid)))
-    return patches
+    """The Gaussians as cells."""
+    return [patch_around(mixture) for mixture in drive.measurements]
+
+
+def patch_around(mixture: GaussianMixture) -> LikelihoodPatch:
+    """A Gaussian on a grid of 1 m and 1 degree, 10 m and 12 degrees around."""
+    corner, first = np.floor(mixture.means[0, :2]) - 10.0, round(float(np.rad2deg(mixture.means[0, 2]))) - 12
+    grid = MapGrid(21, 21, 1.0, *corner.tolist())
+    x, y = grid.centres()
+    yaw = np.deg2rad(first + np.arange(25.0))
+    poses = np.stack(np.meshgrid(y, x, yaw, indexing="ij"), axis=-1)[..., [1, 0, 2]]
+    values = np.maximum(mixture.log_density(poses.reshape(-1, 3)), _FLOOR).reshape(poses.shape[:3])
+    return LikelihoodPatch(values.astype(np.float32), grid, first, 360, _FLOOR, log_uniform_density(grid))
 
 
 def gtsam_levenberg_marquardt(drive: Drive, patches: Sequence[LikelihoodPatch] | None = None) -> FloatArray:

@@ -16,13 +16,16 @@ from fusion.error_correlation import ErrorCorrelation, estimate_error_correlatio
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.factor_graph import AbsoluteFix, LoopClosure, OdometryDrift, SmootherResult, SmootherSettings, smooth
+from fusion.fixed_lag import FixedLagSettings, FixedLagSmoother, LagCounts, LagReport, LagState
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.graph.likelihood_factors import LikelihoodFactors
+from fusion.graph_filter import FilterAndGraph, GraphFilter
 from fusion.grid import MapGrid
 from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
 from fusion.grids.pose_lattice import PoseLattice
+from fusion.hypotheses import Hypothesis, HypothesisSettings, HypothesisSmoother, HypothesisState
 from fusion.kalman_filter import KalmanFilter, KalmanFilterSettings
 from fusion.lazy_orientation import LazyOrientation
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
@@ -55,14 +58,25 @@ __all__ = [
     "ErrorCorrelation",
     "ErrorProfile",
     "Estimate",
+    "FilterAndGraph",
+    "FixedLagSettings",
+    "FixedLagSmoother",
     "GaussianLikelihood",
     "GaussianMixture",
+    "GraphFilter",
     "GridFilter",
     "GridFilterSettings",
     "GridSmootherResult",
+    "Hypothesis",
+    "HypothesisSettings",
+    "HypothesisSmoother",
+    "HypothesisState",
     "KalmanFilter",
     "KalmanFilterSettings",
     "KldSampling",
+    "LagCounts",
+    "LagReport",
+    "LagState",
     "LazyOrientation",
     "LikelihoodEmulator",
     "LikelihoodFactors",

@@ -13,21 +13,22 @@ for bit.
 """
 
 from collections import Counter
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
+from fusion.fixed_lag import FixedLagSettings
 from fusion.likelihood import PoseLikelihood
 from fusion.odometry import OdometryIncrement
-from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.particle_filter import ParticleFilterSettings
 from fusion.prior import UniformPrior
 from fusion.tracking.archive import Tree, read_archive, write_archive
 from fusion.tracking.clock_guard import ClockGuard, Side
+from fusion.tracking.estimators import EstimatorName, estimator_like, settings_of
+from fusion.tracking.estimators import estimator as make_estimator
 from fusion.tracking.likelihood_tree import is_same_likelihood
 from fusion.tracking.odometry_buffer import OdometrySample
 from fusion.tracking.odometry_limits import MotionKind
@@ -81,10 +82,20 @@ class Tracker:
         settings: TrackerSettings | None = None,
         filter_settings: ParticleFilterSettings | None = None,
         seed: int = 0,
+        estimator: EstimatorName = "filter",
+        graph_settings: FixedLagSettings | None = None,
     ) -> Self:
-        """A tracker around a particle filter drawn from a prior, which holds at the first odometry sample."""
+        """A tracker from a prior, which holds at the first odometry sample.
+
+        Parameters
+        ----------
+        estimator : {"filter", "graph", "both"}
+            A particle filter: any prior, finds its place again. A factor graph with a fixed lag: a start known to some
+            metres, re-linearised as the estimate moves, cheap, no recovery. Both: the filter finds the place, the graph
+            says where exactly, see `fusion.graph_filter`.
+        """
         count, seed = checked_whole("particles", particles, least=1), checked_whole("seed", seed, least=0)
-        return cls(ParticleFilter.from_prior(prior, count, seed, filter_settings), settings, seed)
+        return cls(make_estimator(estimator, prior, count, seed, filter_settings, graph_settings), settings, seed)
 
     @property
     def newest_ns(self) -> int | None:
@@ -191,14 +202,13 @@ class Tracker:
             When the file cannot be written, or a likelihood held is of a type that skyfix does not know.
         """
         pose_filter = self._timeline.filter
-        filter_settings = asdict(pose_filter.settings) if isinstance(pose_filter, ParticleFilter) else None
         tree: dict[str, Tree] = {
             "format": _FORMAT,
             "version": _VERSION,
             "settings": self.settings.to_tree(),
             "seed": self._seed,
             "filter": type(pose_filter).__name__,
-            "filter_settings": filter_settings,
+            "filter_settings": settings_of(pose_filter),
             "is_increments": self._is_increments,
             "guard": self._guard.to_tree(),
             "counts": dict(self._counts),
@@ -215,7 +225,8 @@ class Tracker:
         path : str or Path
             The file.
         pose_filter : ResumableFilter, optional
-            A filter with the settings of the one that was saved, in any state; needed if that was no ParticleFilter.
+            A filter with the settings of the one that was saved, in any state; needed if that was of a type of the
+            caller's own.
 
         Raises
         ------
@@ -233,7 +244,7 @@ class Tracker:
         if not isinstance(tree, dict) or (tree.get("format"), tree.get("version")) != (_FORMAT, _VERSION):
             raise SkyfixError(f"{path}: expected a saved tracker of version {_VERSION}, got something else")
         if pose_filter is None and tree["filter_settings"] is not None:
-            pose_filter = ParticleFilter(np.zeros((1, 3)), 0, ParticleFilterSettings(**tree["filter_settings"]))
+            pose_filter = estimator_like(tree["filter"], tree["filter_settings"])
         if pose_filter is None or type(pose_filter).__name__ != tree["filter"]:
             given = "none" if pose_filter is None else type(pose_filter).__name__
             raise SkyfixError(f"{path}: expected a {tree['filter']} to put the state into, got {given}")

@@ -18,6 +18,7 @@ from benchmarks import (
     Candidate,
     Case,
     filter_step,
+    fixed_lag,
     grid_filter,
     inference,
     markdown_table,
@@ -41,6 +42,7 @@ TINY_VOLUME = example_volume(cells=32, bins=36)
 TINY_VOTING = RotMatchNet(RotMatchSettings(4, (4, 4, 8, 8), BevSettings(16.0)))
 TINY: dict[str, Callable[[], Iterator[Case]]] = {
     "filter_step": lambda: filter_step.cases([50, 200], TINY_VOLUME, [8, 16]),
+    "fixed_lag": lambda: fixed_lag.cases([5, 20], 5),
     "grid_filter": lambda: grid_filter.cases([24], headings=64),
     "inference": lambda: inference.cases(TINY_VOTING, position_half_m=4.0, headings=(3,)),
     "smoother": lambda: smoother.cases([5, 20]),
@@ -168,6 +170,18 @@ def test_the_grid_filter_s_peer_has_the_same_moments_and_evidence() -> None:
     assert np.linalg.norm((pose - start)[:2]) > 0.3  # it did move
 
 
+def test_fixed_lag_smoothers_find_the_same_poses() -> None:
+    """Over several lags; GTSAM relinearises only what has moved by a tenth."""
+    ours, peer = fixed_lag.SkyfixRun(lambda one: one), fixed_lag.GtsamRun()
+    whole = fixed_lag.SkyfixRun(smoother.patch_around)
+    for size in (1, 90, 210):
+        found = ours.after(size).estimate().pose
+        np.testing.assert_allclose(found, fixed_lag.truth_at(size), atol=1.5)
+        np.testing.assert_allclose(whole.after(size).estimate().pose, found, atol=0.02)
+        peer.prepare(size)
+        np.testing.assert_allclose(peer.pose, found, atol=0.01)
+
+
 @pytest.mark.parametrize("nodes", [2, 60])
 def test_the_smoother_s_peers_find_the_same_poses(nodes: int) -> None:
     drive = smoother.example_drive(nodes)
@@ -230,7 +244,10 @@ def test_command_prints_a_table_and_writes_the_rows(
     [
         (
             ["nonsense"],
-            "benchmark: expected one of filter_step, grid_filter, inference, smoother, translocnet, got 'nonsense'",
+            (
+                "benchmark: expected one of filter_step, fixed_lag, grid_filter, inference, smoother, translocnet, "
+                "got 'nonsense'"
+            ),
         ),
         (["smoother", "--runs", "0"], "runs: expected >= 1, got 0"),
     ],

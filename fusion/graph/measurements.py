@@ -65,10 +65,14 @@ class Measurements:
         That is 0 for a whole likelihood, and REJECTED where an outlier explains better.
         """
         split = len(self._mixtures)
-        mixed, best = self._mixtures.windowed(centres[:split], covariances[:split])
+        if split == len(self):
+            return self._mixtures.windowed(centres, covariances)
         whole = self._bank.windowed(centres[split:], covariances[split:])
-        chosen = np.append(best, np.where(self._bank.outlier_share(whole.log_mass) > 0.5, REJECTED, 0))
-        if split == 0 or split == len(self):
-            return (whole if split == 0 else mixed), chosen
+        told = np.where(self._bank.outlier_share(whole.log_mass) > 0.5, REJECTED, 0)
+        if split == 0:
+            return whole, told
+        mixed, best = self._mixtures.windowed(centres[:split], covariances[:split])
         names = ("roots", "log_mass", "means", "spreads", "flat")
-        return Windowed(*(np.concatenate([getattr(mixed, name), getattr(whole, name)]) for name in names)), chosen
+        return Windowed(*(np.concatenate([getattr(mixed, name), getattr(whole, name)]) for name in names)), np.append(
+            best, told
+        )

@@ -15,7 +15,6 @@ hypothesis); sums in place of their maxima.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import logsumexp
 
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
@@ -69,7 +68,8 @@ class MixtureBank:
         log_det = np.linalg.slogdet(total)[1] + 2.0 * np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)[:, None]
         log_evidence = self._log_weights - 0.5 * (np.einsum("mki,mki->mk", off, means) + log_det + 3.0 * _LOG_TWO_PI)
         log_evidence = np.column_stack([log_evidence, np.full(len(self), self._log_null)])
-        log_mass = logsumexp(log_evidence, axis=1)
+        top = log_evidence.max(axis=1)
+        log_mass = top + np.log(np.exp(log_evidence - top[:, None]).sum(axis=1))
         share = np.exp(log_evidence - log_mass[:, None])
         mean = np.einsum("mk,mki->mi", share[:, :-1], means)
         outer = means[..., :, None] * means[..., None, :]

@@ -1,6 +1,7 @@
 """Trees of lists, dictionaries, numbers, strings and arrays in one file, exactly: npz with JSON inside, no pickle.
 
-Every array is an entry of the npz; JSON, itself an entry, holds the rest and names the arrays. Python writes floats so
+Every array is an entry of the npz, once, however often it occurs; JSON, itself an entry, holds the rest and names the
+arrays. Python writes floats so
 that they read back bit for bit.
 """
 
@@ -31,7 +32,7 @@ def write_archive(path: str | Path, tree: Tree) -> None:
     """
     path = Path(path)
     arrays: dict[str, NDArray[Any]] = {}
-    text = json.dumps(_packed(tree, arrays), allow_nan=False)
+    text = json.dumps(_packed(tree, arrays, {}), allow_nan=False)
     arrays[_JSON] = np.frombuffer(text.encode(), dtype=np.uint8)
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -56,34 +57,39 @@ def read_archive(path: str | Path) -> Any:
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return _unpacked(json.loads(arrays[_JSON].tobytes().decode()), arrays)
+            return _unpacked(json.loads(arrays[_JSON].tobytes().decode()), arrays, {})
     except OSError as error:
         raise SkyfixError(f"{path}: expected a saved file, got {error.strerror or error}") from error
     except (ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
         raise SkyfixError(f"{path}: expected a saved file, got something else or a damaged one") from error
 
 
-def _packed(tree: Tree, arrays: dict[str, NDArray[Any]]) -> Any:
+def _packed(tree: Tree, arrays: dict[str, NDArray[Any]], names: dict[Any, str]) -> Any:
+    """What JSON can hold; `names` knows the arrays so far by where they lie in memory."""
     if isinstance(tree, np.ndarray):
         if tree.dtype.hasobject:
             raise SkyfixError(f"archive: expected arrays of numbers, got {tree.dtype}")
-        name = f"array{len(arrays)}"
+        place = (tree.__array_interface__["data"][0], tree.shape, tree.strides, tree.dtype.str)
+        name = names.setdefault(place, f"array{len(arrays)}")
         arrays[name] = tree
         return {_ARRAY: name}
     if isinstance(tree, dict):
         if _ARRAY in tree:
             raise SkyfixError(f"archive: expected keys other than {_ARRAY}, got it")
-        return {key: _packed(value, arrays) for key, value in tree.items()}
+        return {key: _packed(value, arrays, names) for key, value in tree.items()}
     if isinstance(tree, list):
-        return [_packed(value, arrays) for value in tree]
+        return [_packed(value, arrays, names) for value in tree]
     return tree
 
 
-def _unpacked(packed: Any, arrays: Any) -> Any:
+def _unpacked(packed: Any, arrays: Any, known: dict[str, NDArray[Any]]) -> Any:
     if isinstance(packed, dict):
         if packed.keys() == {_ARRAY}:
-            return arrays[packed[_ARRAY]]
-        return {key: _unpacked(value, arrays) for key, value in packed.items()}
+            name = packed[_ARRAY]
+            if name not in known:
+                known[name] = arrays[name]
+            return known[name]
+        return {key: _unpacked(value, arrays, known) for key, value in packed.items()}
     if isinstance(packed, list):
-        return [_unpacked(value, arrays) for value in packed]
+        return [_unpacked(value, arrays, known) for value in packed]
     return packed

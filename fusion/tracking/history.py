@@ -6,6 +6,7 @@ from typing import Any
 
 from fusion.error_memory import ErrorMemory
 from fusion.tracking.archive import Tree
+from fusion.tracking.state_tree import state_tree, state_values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,8 +32,7 @@ class Node:
 
     def to_tree(self) -> dict[str, Tree]:
         """Everything, for a file."""
-        names = self.state.__dataclass_fields__
-        state: dict[str, Tree] = {name: getattr(self.state, name) for name in names}
+        state = state_tree(self.state)
         memory: dict[str, Tree] = {"shared": self.memory.shared, "log_variance": self.memory.log_variance}
         return {"stamp_ns": self.stamp_ns, "distance_m": self.distance_m, "memory": memory, "state": state}
 
@@ -95,7 +95,12 @@ def history_from_tree(tree: Any, state_type: type) -> History:
     """The history that was written, of a filter whose states are of a given type."""
     return History(
         [
-            Node(entry["stamp_ns"], state_type(**entry["state"]), entry["distance_m"], ErrorMemory(**entry["memory"]))
+            Node(
+                entry["stamp_ns"],
+                state_type(**state_values(entry["state"])),
+                entry["distance_m"],
+                ErrorMemory(**entry["memory"]),
+            )
             for entry in tree
         ]
     )

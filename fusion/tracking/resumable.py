@@ -8,8 +8,9 @@ from fusion.pose_filter import PoseFilter
 class ResumableFilter(PoseFilter, Protocol):
     """A pose filter whose state can be taken out and put back.
 
-    A state is a dataclass whose fields are arrays, numbers and strings, so that it can be written to a file. It holds
-    all that the filter's answers depend on, settings apart.
+    A state is a dataclass whose fields are arrays, numbers and strings, so that it can be written to a file, or
+    dataclasses that `fusion.tracking.state_tree` knows. It holds all that the filter's answers depend on, settings
+    apart.
     """
 
     def state(self) -> Any:
