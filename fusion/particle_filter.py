@@ -23,7 +23,7 @@ from fusion.estimate import Estimate
 from fusion.grid import MapGrid
 from fusion.likelihood import OutlierMixture, PoseLikelihood, checked_temperature
 from fusion.odometry import OdometryIncrement
-from fusion.particles.cloud import Cloud, Moments, positive_definite
+from fusion.particles.cloud import Cloud
 from fusion.particles.clusters import find_clusters
 from fusion.particles.filter_state import ParticleFilterState, generator_of, generator_state
 from fusion.particles.guided_proposal import guided
@@ -31,8 +31,9 @@ from fusion.particles.lattice_density import LatticeDensity
 from fusion.particles.lookup import lookup_of
 from fusion.particles.lost import LostModel, log_uniform_evidence, probability
 from fusion.particles.map_start import stratified_poses
+from fusion.particles.moments import Moments, positive_definite
 from fusion.particles.particle_filter_settings import ParticleFilterSettings
-from fusion.particles.regularisation import is_compact, regularised, silverman_bandwidth
+from fusion.particles.regularisation import is_compact, silverman_bandwidth
 from fusion.pose_filter import UpdateReport
 from fusion.prior import UniformPrior
 from fusion.resampling import RESAMPLERS
@@ -280,7 +281,7 @@ class ParticleFilter:
             if is_compact(moments.covariance):
                 cloud.regularise(scale * silverman_bandwidth(count, 3))
             else:
-                cloud.replace(regularised(cloud.poses(), scale, self._rng), None)
+                cloud.regularise_in_clusters(scale)
 
     def _inject(self, fresh: FloatArray) -> None:
         """Add particles (n, 3) that have the weight of being lost together."""
