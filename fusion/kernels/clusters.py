@@ -30,7 +30,7 @@ def cells_of(
 
 @numba.njit(**_OPTIONS)
 def components(cells: NDArray[Any], size: int, cols: int, yaw_cells: int) -> tuple[NDArray[Any], int]:
-    """Label (N,), whole numbers of the cells' kind, of each occupied cell in a grid of `size` cells, corners and the seam joined; and how many."""
+    """Label (N,) of each occupied cell in a grid of `size` cells, corners and the seam joined; and how many."""
     label_of = np.full(size, -1, np.int32)
     for cell in cells:
         label_of[cell] = -2  # occupied, not yet reached

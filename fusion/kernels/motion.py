@@ -70,7 +70,11 @@ def regularise_in_clusters(start: int, n: int, labels: Int32s, clusters: Float32
         mx, my, mt = take(clusters, c), take(clusters, np.int32(c + 1)), take(clusters, np.int32(c + 2))
         shrink, r00 = take(clusters, np.int32(c + 3)), take(clusters, np.int32(c + 4))
         r10, r11 = take(clusters, np.int32(c + 5)), take(clusters, np.int32(c + 6))
-        r20, r21, r22 = take(clusters, np.int32(c + 7)), take(clusters, np.int32(c + 8)), take(clusters, np.int32(c + 9))
+        r20, r21, r22 = (
+            take(clusters, np.int32(c + 7)),
+            take(clusters, np.int32(c + 8)),
+            take(clusters, np.int32(c + 9)),
+        )
         e0, e1, e2 = get(s, E3 + j), get(s, E4 + j), get(s, E5 + j)
         put(s, X + j, mx + shrink * (get(s, X + j) - mx) + r00 * e0)
         put(s, Y + j, my + shrink * (get(s, Y + j) - my) + (r10 * e0 + r11 * e1))

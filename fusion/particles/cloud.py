@@ -6,7 +6,6 @@ the key, on the number of the order and on the particle, so looking changes noth
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from math import cos, log, pi, sin, sqrt
@@ -36,7 +35,7 @@ from fusion.kernels.layout import (
 )
 from fusion.kernels.moments import arc_blocks, combined
 from fusion.kernels.resample import block_masses, resample_blocks, share_out, spread_blocks
-from fusion.kernels.step import step_blocks
+from fusion.kernels.step import step, step_blocks
 from fusion.particles.lookup import NO_SLOTS, NO_TABLE, Lookup
 from fusion.particles.moments import Moments, lower_root, wrapped
 from fusion.particles.regularisation import cluster_kernels, silverman_bandwidth
@@ -248,7 +247,7 @@ class Cloud:
         out = self._buffer("log weights", self._count, np.float64)
         weigh = _NOT_WEIGHED if lookup is None else lookup.arguments(self._anchor, outlier_probability)
         look = np.array((*weigh, *self._reference, self._shift))
-        self._step(source, motion, cloud, lookup, look, out)
+        sums = self._step(source, motion, cloud, lookup, look, out)
         if order is not None:
             self._spare["cloud"], self._xyt = source, cloud
             if len(ancestors):
@@ -260,7 +259,7 @@ class Cloud:
             self._spare["log weights"], self._log_weights = before, out
         else:
             self._spare["log weights"] = out
-        return self._summary(weigh, look)
+        return self._summary(sums, weigh, look)
 
     def _go_on(self, motion: list[float]) -> None:
         """Move the reference pose along, and the anchor when the cloud has left it behind."""
@@ -273,7 +272,7 @@ class Cloud:
             x, y = x - east, y - north
             if self._moments is not None:
                 mean = self._moments.mean
-                self._moments = replace(self._moments, mean=(mean[0] - east, mean[1] - north, mean[2]))
+                self._moments = self._moments._replace(mean=(mean[0] - east, mean[1] - north, mean[2]))
         along, across = cos(yaw), sin(yaw)
         self._reference = (x + along * dx - across * dy, y + across * dx + along * dy, wrapped(yaw + turn))
 
@@ -285,7 +284,7 @@ class Cloud:
         lookup: Lookup | None,
         look: FloatArray,
         out: FloatArray,
-    ) -> None:
+    ) -> tuple[float, ...]:
         blocks = -(-self._count // BLOCK)
         if len(self._sums) != blocks:
             self._sums = np.zeros((blocks, SUMS))
@@ -295,21 +294,22 @@ class Cloud:
             if lookup is None
             else (lookup.mode, lookup.table, lookup.location, lookup.slots)
         )
+        if self._shares(blocks) == 1:
+            return step(*ordered, *weigh, look, self._log_weights, out, self._sums)
         self._share(step_blocks, blocks, *ordered, *weigh, look, self._log_weights, out, self._sums)
+        return combined(self._sums, look)
 
-    def _summary(self, weigh: list[float], look: FloatArray) -> Moments:
+    def _summary(self, sums: tuple[float, ...], weigh: list[float], look: FloatArray) -> Moments:
         """Moments from the sums; about the mean itself where the reference was too far from it to be accurate."""
         x, y, yaw = self._reference
-        sums = combined(self._sums, look)
         if (sums[3] - x) ** 2 > 1e3 * sums[6] or (sums[4] - y) ** 2 > 1e3 * sums[8]:
             x, y, yaw = self._reference = sums[3], sums[4], wrapped(yaw + sums[5])
             look = np.array((*weigh, x, y, yaw, 0.0))
             weights = self._log_weights
             out = weights if len(weights) else self._buffer("log weights", self._count, np.float64)
-            self._step(self._xyt, _STAY, self._xyt, None, look, out)
+            sums = self._step(self._xyt, _STAY, self._xyt, None, look, out)
             if len(weights) == 0:
                 self._spare["log weights"] = out
-            sums = combined(self._sums, look)
         if sums[12] + abs(sums[5]) >= _WHOLE_CIRCLE:
             low, high = (-4.0, sums[5] - pi) if sums[5] > 0.0 else (sums[5] + pi, 4.0)
             self._share(arc_blocks, len(self._sums), self._xyt, self._log_weights, look, low, high, self._sums)

@@ -25,7 +25,7 @@ NO_TABLE = read_only(np.zeros(0, np.float32))
 NO_SLOTS = read_only(np.zeros(0, np.int32))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)  # made once a measurement: a frozen one takes twice as long to make
 class Lookup:
     """Log densities of cells, and how to temper them.
 
@@ -64,7 +64,7 @@ class Lookup:
     def __post_init__(self) -> None:
         if self.table.flags.writeable or self.location.flags.writeable or self.slots.flags.writeable:
             for name in ("table", "location", "slots"):  # one kind of array, or the step is compiled once more
-                object.__setattr__(self, name, read_only(getattr(self, name)))
+                setattr(self, name, read_only(getattr(self, name)))
 
     @property
     def mode(self) -> int:

@@ -1,7 +1,7 @@
-"""Mean and covariance of a cloud, and the roots of covariances, in plain numbers: small arrays cost more than the sums."""
+"""Mean and covariance of a cloud, and roots of covariances, in plain numbers: small arrays cost more than the sums."""
 
-from dataclasses import dataclass
 from math import pi, remainder, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,8 +12,7 @@ _ROUNDING = 1e-14
 _FLOOR_M2, _FLOOR_RAD2 = float(VARIANCE_FLOOR[0, 0]), float(VARIANCE_FLOOR[2, 2])
 
 
-@dataclass(frozen=True, slots=True)
-class Moments:
+class Moments(NamedTuple):
     """Sums over a weighted cloud.
 
     Parameters
