@@ -10,7 +10,7 @@ A step is one pass over the particles, see `fusion.particles.cloud`: `predict` w
 Sources: Gordon, Salmond, Smith 1993; Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, 8.3.5 (augmented MCL).
 """
 
-from math import hypot, inf
+from math import hypot, inf, log
 from typing import Self
 
 import numpy as np
@@ -213,7 +213,10 @@ class ParticleFilter:
         if injected:
             measurement = likelihood.tempered(temperature).with_outliers(settings.outlier_probability)
             self._inject(measurement.sample(injected, self._rng))
-        return UpdateReport(log_evidence, size, bool(injected or is_degenerate), injected, self._lost)
+        jump = log_odds - log_uniform + log_evidence - log(likelihood.searched_volume) if injected else -inf
+        return UpdateReport(
+            log_evidence, size, bool(injected or is_degenerate), injected, self._lost, log_jump_density=jump
+        )
 
     def estimate(self, stamp_ns: int, max_modes: int = 0) -> Estimate:
         """Summary of the cloud; with its `max_modes` heaviest clusters when that is not 0.

@@ -29,6 +29,7 @@ from fusion.odometry_calibration import OdometryCalibration
 from fusion.particle_filter import ParticleFilter
 from fusion.particle_smoother import ParticleSmootherSettings, sample_paths
 from fusion.particles.cloud_history import CloudHistory
+from fusion.pose_filter import UpdateReport
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 from sequences.metrics import summarise
@@ -178,9 +179,9 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
             since_m += float(np.hypot(*increment.delta[:2]))
         if since_m >= settings.measure_every_m:
             likelihood = emulator.measure(poses[frame], since_m)
-            memory = _weigh(particles, likelihood, settings.correlation(since_m), memory)
+            report, memory = _weigh(particles, likelihood, settings.correlation(since_m), memory)
             answers[frame], since_m = likelihood.answer, 0.0
-            history.record(particles, stamp)
+            history.record(particles, stamp, report)
         elif frame == len(stamps) - 1:
             history.record(particles, stamp)
         estimates.append(particles.estimate(stamp))
@@ -205,12 +206,12 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
 
 def _weigh(
     particles: ParticleFilter, likelihood: EmulatedLikelihood, correlation: float, memory: ErrorMemory
-) -> ErrorMemory:
+) -> tuple[UpdateReport, ErrorMemory]:
     """Weigh by a measurement, flattened for what it repeats of the last one's error."""
     before = particles.estimate(0).covariance
     temperature = memory.temperature(correlation, before)
-    particles.update(likelihood, temperature)
-    return memory.after(correlation, temperature, before, particles.estimate(0).covariance)
+    report = particles.update(likelihood, temperature)
+    return report, memory.after(correlation, temperature, before, particles.estimate(0).covariance)
 
 
 def _placed(deltas: FloatArray, start: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ def extent(values: Float32s) -> tuple[float, float]:
     for i in range(len(values)):
         least = -larger(-values[i], -least)
         greatest = larger(values[i], greatest)
-    return least, greatest
+    return np.float64(least), np.float64(greatest)
 
 
 @numba.njit(**KERNEL)
