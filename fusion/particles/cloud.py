@@ -5,9 +5,6 @@ the particles, which is that of the next measurement, or of whoever looks at the
 the key, on the number of the order and on the particle, so looking changes nothing.
 """
 
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from itertools import pairwise
 from math import cos, log, pi, sin, sqrt
 from typing import Any
 
@@ -15,43 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.arrays import Float32Array, FloatArray
+from fusion.kernels import layout as at
 from fusion.kernels.cloud_clusters import gather_copies
-from fusion.kernels.layout import (
-    BLOCK,
-    CENTRE,
-    CLUSTER_KERNELS,
-    DELTA,
-    KERNEL_ROOT,
-    KIND,
-    MOTION_SIZE,
-    MOVED,
-    NOTHING,
-    ONE_KERNEL,
-    ROOT,
-    SHIFT,
-    SHRINK,
-    SUMS,
-    WEIGH_SIZE,
-)
 from fusion.kernels.moments import arc_blocks, combined
-from fusion.kernels.resample import block_masses, resample_blocks, share_out, spread_blocks
 from fusion.kernels.step import step, step_blocks
 from fusion.particles.lookup import NO_SLOTS, NO_TABLE, Lookup
 from fusion.particles.moments import Moments, lower_root, wrapped
 from fusion.particles.regularisation import cluster_kernels, silverman_bandwidth
+from fusion.particles.shared_work import find_ancestors, share, sharers
 
 _REACH_M = 64.0  # the anchor follows the cloud when its mean is farther away
 _NOBODY = np.zeros(0, np.int32)
 _STAY = np.zeros(0)
 _EQUAL = np.zeros(0)
-_STILL = [0.0] * MOTION_SIZE
-_NOT_WEIGHED = [0.0] * WEIGH_SIZE
+_STILL = [0.0] * at.MOTION_SIZE
+_NOT_WEIGHED = [0.0] * at.WEIGH_SIZE
 _WHOLE_CIRCLE = pi - 1e-5
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="skyfix")
 
 
 class Cloud:
@@ -92,7 +68,7 @@ class Cloud:
         self._ancestors = _NOBODY
         self._labels, self._clusters = _NOBODY, NO_TABLE
         self._motion: list[float] | None = None
-        self._sums = np.zeros((0, SUMS))
+        self._sums = np.zeros((0, at.SUMS))
         self._reference = (0.0, 0.0, float(poses[0, 2]))
         self._moments: Moments | None = self._pass(None, 0.0)
         self._reference = self._moments.mean
@@ -151,12 +127,12 @@ class Cloud:
 
     def move(self, delta: list[float], covariance: list[list[float]]) -> None:
         """Order a motion: an increment and its covariance, on the axes of every particle's body."""
-        if self._motion is not None and self._motion[MOVED] > 0.0:
+        if self._motion is not None and self._motion[at.MOVED] > 0.0:
             self._settle()
         motion = self._order()
-        motion[DELTA : DELTA + 3] = delta
-        motion[ROOT : ROOT + 9] = lower_root(covariance)
-        motion[MOVED] = 1.0
+        motion[at.DELTA : at.DELTA + 3] = delta
+        motion[at.ROOT : at.ROOT + 9] = lower_root(covariance)
+        motion[at.MOVED] = 1.0
         self._moments = None
 
     def weigh(self, lookup: Lookup, outlier_probability: float) -> float:
@@ -182,15 +158,8 @@ class Cloud:
         self._settle()
         if len(self._log_weights) == 0:
             self._log_weights = np.zeros(self._count)
-        weights, sums, ancestors = self._log_weights, self._sums, self._buffer("ancestors", count, np.int32)
-        blocks = len(sums)
-        if self._shares(blocks) == 1:
-            resample_blocks(weights, sums, offset, ancestors)
-        else:
-            masses, edges = np.empty(blocks), np.empty(blocks + 1)
-            self._share(block_masses, blocks, weights, sums, masses)
-            share_out(sums, masses, count, edges)
-            self._share(spread_blocks, blocks, weights, sums, masses, edges, offset, ancestors)
+        ancestors = self._buffer("ancestors", count, np.int32)
+        find_ancestors(self._threads, self._log_weights, self._sums, offset, ancestors)
         self.keep(ancestors)
 
     def keep(self, ancestors: NDArray[np.int32]) -> None:
@@ -205,10 +174,10 @@ class Cloud:
     def regularise(self, width: float) -> None:
         """Order kernel noise of `width` standard deviations, with shrinkage, on top of resampling."""
         moments, motion = self.moments(), self._order()
-        motion[CENTRE : CENTRE + 3] = moments.mean
-        motion[SHRINK] = sqrt(1.0 - width * width)
-        motion[KERNEL_ROOT : KERNEL_ROOT + 9] = [width * value for value in lower_root(moments.covariance)]
-        motion[KIND] = ONE_KERNEL
+        motion[at.CENTRE : at.CENTRE + 3] = moments.mean
+        motion[at.SHRINK] = sqrt(1.0 - width * width)
+        motion[at.KERNEL_ROOT : at.KERNEL_ROOT + 9] = [width * value for value in lower_root(moments.covariance)]
+        motion[at.KIND] = at.ONE_KERNEL
 
     def regularise_in_clusters(self, scale: float) -> None:
         """Order kernel noise of `scale` times Silverman's bandwidth for each cluster of what resampling has kept."""
@@ -222,7 +191,7 @@ class Cloud:
             self.regularise(scale * silverman_bandwidth(self._count, 3))
         else:
             self._labels, self._clusters = found
-            self._order()[KIND] = CLUSTER_KERNELS
+            self._order()[at.KIND] = at.CLUSTER_KERNELS
 
     def _order(self) -> list[float]:
         if self._motion is None:
@@ -252,7 +221,7 @@ class Cloud:
             self._spare["cloud"], self._xyt = source, cloud
             if len(ancestors):
                 self._spare["ancestors"] = ancestors
-            self._epoch += order[MOVED] > 0.0
+            self._epoch += order[at.MOVED] > 0.0
             self._ancestors = self._labels = _NOBODY
             self._clusters, self._motion = NO_TABLE, None
         if lookup is not None or len(before):
@@ -264,10 +233,10 @@ class Cloud:
     def _go_on(self, motion: list[float]) -> None:
         """Move the reference pose along, and the anchor when the cloud has left it behind."""
         x, y, yaw = self._reference
-        dx, dy, turn = motion[DELTA : DELTA + 3]
+        dx, dy, turn = motion[at.DELTA : at.DELTA + 3]
         if abs(x) > _REACH_M or abs(y) > _REACH_M:
             east, north = (float(round(at)) if abs(at) > _REACH_M else 0.0 for at in (x, y))
-            motion[SHIFT : SHIFT + 2] = east, north
+            motion[at.SHIFT : at.SHIFT + 2] = east, north
             self._anchor = (self._anchor[0] + east, self._anchor[1] + north)
             x, y = x - east, y - north
             if self._moments is not None:
@@ -285,18 +254,18 @@ class Cloud:
         look: FloatArray,
         out: FloatArray,
     ) -> tuple[float, ...]:
-        blocks = -(-self._count // BLOCK)
+        blocks = -(-self._count // at.BLOCK)
         if len(self._sums) != blocks:
-            self._sums = np.zeros((blocks, SUMS))
+            self._sums = np.zeros((blocks, at.SUMS))
         ordered = (source, self._ancestors, self._labels, self._clusters, motion, self._key, self._epoch, cloud)
         weigh = (
-            (NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS)
+            (at.NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS)
             if lookup is None
             else (lookup.mode, lookup.table, lookup.location, lookup.slots)
         )
-        if self._shares(blocks) == 1:
+        if sharers(self._threads, blocks) == 1:
             return step(*ordered, *weigh, look, self._log_weights, out, self._sums)
-        self._share(step_blocks, blocks, *ordered, *weigh, look, self._log_weights, out, self._sums)
+        share(self._threads, step_blocks, blocks, *ordered, *weigh, look, self._log_weights, out, self._sums)
         return combined(self._sums, look)
 
     def _summary(self, sums: tuple[float, ...], weigh: list[float], look: FloatArray) -> Moments:
@@ -312,7 +281,7 @@ class Cloud:
                 self._spare["log weights"] = out
         if sums[12] + abs(sums[5]) >= _WHOLE_CIRCLE:
             low, high = (-4.0, sums[5] - pi) if sums[5] > 0.0 else (sums[5] + pi, 4.0)
-            self._share(arc_blocks, len(self._sums), self._xyt, self._log_weights, look, low, high, self._sums)
+            share(self._threads, arc_blocks, len(self._sums), self._xyt, self._log_weights, look, low, high, self._sums)
             sums = combined(self._sums, look)
         largest, self._log_total, size, x, y, turned, xx, xy, yy, xt, yt, tt, _ = sums
         self._shift = largest if len(self._log_weights) else 0.0
@@ -322,19 +291,3 @@ class Cloud:
         """Memory that was used before, when it has the right size: fresh memory costs more than the step."""
         spare = self._spare.pop(name, None)
         return spare if spare is not None and len(spare) == size else np.empty(size, kind)
-
-    def _shares(self, blocks: int) -> int:
-        """Number of threads among which work on all blocks is shared, when that pays."""
-        return 1 if self._threads == 1 else max(1, min(self._threads, blocks // 4))
-
-    def _share(self, kernel: Any, blocks: int, *arguments: Any) -> None:
-        """Run a kernel over all blocks."""
-        threads = self._shares(blocks)
-        if threads == 1:
-            kernel(0, blocks, *arguments)
-            return
-        edges = [blocks * part // threads for part in range(threads + 1)]
-        work = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in pairwise(edges[1:])]
-        kernel(edges[0], edges[1], *arguments)
-        for each in work:
-            each.result()
