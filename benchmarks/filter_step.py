@@ -21,7 +21,7 @@ from benchmarks.filter_packages import package_candidates
 from benchmarks.filter_peers import FilterpyFilter, NumpyFilter, TorchFilter
 from benchmarks.gather_floor import gather_floor
 from benchmarks.runner import Candidate, Case
-from fusion import LikelihoodVolume, OdometryIncrement, ParticleFilter, ParticleFilterSettings
+from fusion import LikelihoodVolume, MapGrid, OdometryIncrement, ParticleFilter, ParticleFilterSettings
 from fusion.arrays import FloatArray
 from fusion.resampling import systematic
 
@@ -43,14 +43,24 @@ def skyfix_step(particles: ParticleFilter, volume: LikelihoodVolume) -> Estimate
 
 
 def _skyfix(particles: FloatArray, volume: LikelihoodVolume, settings: ParticleFilterSettings) -> Candidate:
+    faint = _faint(volume)
+
     def prepare() -> Callable[[], Estimated]:
         started = ParticleFilter(particles, SEED, settings)
-        started.predict(_STANDSTILL)  # a filter that has moved before: its memory is in place
+        started.predict(_STANDSTILL)
+        started.update(faint)  # resamples, and what that puts off until the next pass is in the time
         started.estimate(0)
         return lambda: skyfix_step(started, volume)
 
     name = "skyfix" if settings.regularisation == 0.0 else "skyfix with kernel noise (its default)"
     return Candidate(name if settings.threads == 1 else f"{name}, {settings.threads} threads", prepare)
+
+
+def _faint(volume: LikelihoodVolume) -> LikelihoodVolume:
+    """Four cells over the same crop that say next to nothing: the cloud is resampled and stays where it is."""
+    grid = volume.grid
+    quarters = MapGrid(2, 2, 0.5 * grid.width_m, grid.x0, grid.y0)
+    return LikelihoodVolume.from_scores(np.array([[[0.0], [0.01]], [[0.01], [0.0]]]), quarters)
 
 
 def _floor(particles: FloatArray, volume: LikelihoodVolume) -> Candidate:

@@ -5,6 +5,7 @@ crop x [-pi, pi). Where nothing was evaluated there is a floor, never -inf, so t
 """
 
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Protocol, Self
 
 import numpy as np
@@ -69,7 +70,7 @@ def log_uniform_density(grid: MapGrid) -> float:
 
 def checked_temperature(temperature: float) -> float:
     """A temperature that can divide log densities: finite and positive, or SkyfixError."""
-    if not (np.isfinite(temperature) and temperature > 0.0):
+    if not (isfinite(temperature) and temperature > 0.0):
         raise SkyfixError(f"temperature: expected > 0, got {temperature}")
     return float(temperature)
 

@@ -10,7 +10,7 @@ A step is one pass over the particles, see `fusion.particles.cloud`: `predict` w
 Sources: Gordon, Salmond, Smith 1993; Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, 8.3.5 (augmented MCL).
 """
 
-from math import hypot, inf
+from math import hypot, inf, log
 from typing import Self
 
 import numpy as np
@@ -23,7 +23,7 @@ from fusion.estimate import Estimate
 from fusion.grid import MapGrid
 from fusion.likelihood import OutlierMixture, PoseLikelihood, checked_temperature
 from fusion.odometry import OdometryIncrement
-from fusion.particles.cloud import Cloud, Moments, positive_definite
+from fusion.particles.cloud import Cloud
 from fusion.particles.clusters import find_clusters
 from fusion.particles.filter_state import ParticleFilterState, generator_of, generator_state
 from fusion.particles.guided_proposal import guided
@@ -31,8 +31,9 @@ from fusion.particles.lattice_density import LatticeDensity
 from fusion.particles.lookup import lookup_of
 from fusion.particles.lost import LostModel, log_uniform_evidence, probability
 from fusion.particles.map_start import stratified_poses
+from fusion.particles.moments import Moments, positive_definite
 from fusion.particles.particle_filter_settings import ParticleFilterSettings
-from fusion.particles.regularisation import is_compact, regularised, silverman_bandwidth
+from fusion.particles.regularisation import is_compact, silverman_bandwidth
 from fusion.pose_filter import UpdateReport
 from fusion.prior import UniformPrior
 from fusion.resampling import RESAMPLERS
@@ -212,7 +213,10 @@ class ParticleFilter:
         if injected:
             measurement = likelihood.tempered(temperature).with_outliers(settings.outlier_probability)
             self._inject(measurement.sample(injected, self._rng))
-        return UpdateReport(log_evidence, size, bool(injected or is_degenerate), injected, self._lost)
+        jump = log_odds - log_uniform + log_evidence - log(likelihood.searched_volume) if injected else -inf
+        return UpdateReport(
+            log_evidence, size, bool(injected or is_degenerate), injected, self._lost, log_jump_density=jump
+        )
 
     def estimate(self, stamp_ns: int, max_modes: int = 0) -> Estimate:
         """Summary of the cloud; with its `max_modes` heaviest clusters when that is not 0.
@@ -280,7 +284,7 @@ class ParticleFilter:
             if is_compact(moments.covariance):
                 cloud.regularise(scale * silverman_bandwidth(count, 3))
             else:
-                cloud.replace(regularised(cloud.poses(), scale, self._rng), None)
+                cloud.regularise_in_clusters(scale)
 
     def _inject(self, fresh: FloatArray) -> None:
         """Add particles (n, 3) that have the weight of being lost together."""

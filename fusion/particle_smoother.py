@@ -5,8 +5,15 @@ each time to a particle from which the odometry could have brought it where it i
 of the joint smoothing density of the recorded stamps, multimodal or not. Between records the odometry's own
 conditional density fills in the other stamps (see `odometry_bridge`).
 
-Where a filter was lost and drew particles anew, no odometry leads back: paths then go on from the particle nearest in
-the odometry's metric, and their spread says nothing of how wrong the cloud before was. As many nodes as measurements,
+Where a filter was lost and drew particles anew, a pose may have come by the odometry or from anywhere. The filter's
+mixture says how likely each is: with j the odds of being lost before the measurement times the density of a lost pose,
+the particle before y is i with a probability in proportion to
+
+    w_i (p(y | x_i, odometry) + j)
+
+so with probability j / (j + sum_i w_i p(y | x_i, odometry)) a path jumps: it goes on from any particle of the cloud
+before, and between the two records it drives as the odometry says until the jump. The history must have been given the
+filter's reports (`CloudHistory.record`). As many nodes as measurements,
 a few metres apart, are better than many more: the finer the step, the fewer particles could have led to a particle.
 
 Sources: Godsill, Doucet, West, "Monte Carlo smoothing for nonlinear time series", JASA 2004; Douc, Garivier,
@@ -19,13 +26,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion import se2
-from fusion.arrays import FloatArray, IntArray, read_only
+from fusion.arrays import BoolArray, FloatArray, IntArray, read_only
 from fusion.errors import SkyfixError
-from fusion.kernels.backward import step_back
-from fusion.odometry import accumulate
-from fusion.particles.cloud_history import CloudHistory
+from fusion.kernels.backward import motion_density, step_back
+from fusion.odometry import OdometryIncrement, accumulate
+from fusion.particles.cloud_history import CloudHistory, RecordedCloud
 from fusion.particles.clusters import VARIANCE_FLOOR
 from fusion.particles.odometry_bridge import bridge
+from fusion.particles.regularisation import matrix_root
 from fusion.trajectory import Trajectory
 
 
@@ -76,12 +84,15 @@ class PathSamples:
     paths : (M, T, 3) float64
         ``[x, y, yaw]``, map frame; yaw wrapped.
     accepted_share : float
-        Share of the steps back that rejection sampling settled.
+        Share of the steps back that rejection sampling settled; jumps are not among them.
+    jumped : (M, R - 1) bool
+        Whether each path jumped just before the second and the later ones of the R records.
     """
 
     stamp_ns: IntArray
     paths: FloatArray
     accepted_share: float
+    jumped: BoolArray
 
     def trajectory(self) -> Trajectory:
         """Means, circular in yaw, with covariances of the paths; a millimetre is added, so that they are positive
@@ -129,25 +140,53 @@ def sample_paths(
     last = rng.choice(len(clouds[-1].weights), size=settings.paths, p=clouds[-1].weights)
     at_records = np.empty((settings.paths, len(clouds), 3))
     at_records[:, -1] = clouds[-1].particles[last]
-    accepted = 0
+    accepted, jumped = 0, np.zeros((settings.paths, len(clouds) - 1), dtype=np.bool_)
     for t in range(len(clouds) - 2, -1, -1):
-        motion = accumulate(motions[t])
+        cloud, motion = clouds[t], accumulate(motions[t])
         whiten = np.linalg.inv(np.linalg.cholesky(motion.covariance + floor))
         later = np.ascontiguousarray(at_records[:, t + 1])
+        jumped[:, t] = _jumps(cloud, clouds[t + 1].jump_density, later, motion.delta, whiten, rng)
+        stays = ~jumped[:, t]
         before, found = step_back(
-            clouds[t].particles, clouds[t].weights, later, motion.delta, whiten, settings.max_rejections, rng
+            cloud.particles, cloud.weights, later[stays], motion.delta, whiten, settings.max_rejections, rng
         )
-        at_records[:, t] = clouds[t].particles[before]
+        at_records[stays, t] = cloud.particles[before]
+        anyone = rng.choice(len(cloud.weights), size=settings.paths - len(before), p=cloud.weights)
+        at_records[~stays, t] = cloud.particles[anyone]
         accepted += found
-    steps = settings.paths * (len(clouds) - 1)
+    steps = jumped.size - int(jumped.sum())
     share = accepted / steps if steps else 1.0
+    jumped = read_only(jumped)
     if not all_stamps:
         stamps = np.array([cloud.stamp_ns for cloud in clouds], dtype=np.int64)
-        return PathSamples(read_only(stamps), read_only(at_records), share)
+        return PathSamples(read_only(stamps), read_only(at_records), share, jumped)
     stamp_list, pieces = [clouds[0].stamp_ns], [at_records[:, :1]]
     for t, motion_between in enumerate(motions):
-        between = bridge(at_records[:, t], at_records[:, t + 1], motion_between, rng)
+        ends = at_records[:, t + 1].copy()
+        ends[jumped[:, t]] = _driven(at_records[jumped[:, t], t], accumulate(motion_between), rng)
+        between = bridge(at_records[:, t], ends, motion_between, rng)
         pieces += [between, at_records[:, t + 1 : t + 2]]
         stamp_list += [increment.stamp_ns for increment in motion_between]
     paths = np.concatenate(pieces, axis=1)
-    return PathSamples(read_only(np.array(stamp_list, dtype=np.int64)), read_only(paths), share)
+    return PathSamples(read_only(np.array(stamp_list, dtype=np.int64)), read_only(paths), share, jumped)
+
+
+def _jumps(
+    cloud: RecordedCloud,
+    jump_density: float,
+    later: FloatArray,
+    delta: FloatArray,
+    whiten: FloatArray,
+    rng: np.random.Generator,
+) -> BoolArray:
+    """Whether each of the poses (M, 3) at the later record came from anywhere, drawn."""
+    if jump_density == 0.0:
+        return np.zeros(len(later), dtype=np.bool_)
+    by_odometry = motion_density(cloud.particles, cloud.weights, later, delta, whiten)
+    return rng.random(len(later)) * (by_odometry + jump_density) < jump_density
+
+
+def _driven(poses: FloatArray, motion: OdometryIncrement, rng: np.random.Generator) -> FloatArray:
+    """Where the odometry and its noise take poses (n, 3)."""
+    noise = rng.standard_normal((len(poses), 3)) @ matrix_root(motion.covariance).T
+    return se2.compose(poses, motion.delta + noise)

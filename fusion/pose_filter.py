@@ -1,6 +1,7 @@
 """What every filter does: move by odometry, weigh by a likelihood, answer with an estimate."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import Protocol
 
 from fusion.estimate import Estimate
@@ -27,6 +28,10 @@ class UpdateReport:
     used : bool
         Whether the measurement counted; a filter may leave one out that it took while standing still. The other
         numbers are then those of the last one that did.
+    log_jump_density : float
+        Where particles were injected, ln of the odds, before the measurement, of being lost, times the density (per m^2
+        rad) that a lost one has anywhere: what a smoother weighs against the odometry's density. Minus infinity where
+        nothing but odometry leads to a particle.
     """
 
     log_evidence: float
@@ -35,6 +40,7 @@ class UpdateReport:
     injected: int = 0
     lost_score: float = 0.0
     used: bool = True
+    log_jump_density: float = -inf
 
 
 class PoseFilter(Protocol):

@@ -18,7 +18,6 @@ import numpy as np
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
 from fusion.consistency import error_correlation
-from fusion.emulation.emulated_likelihood import EmulatedLikelihood
 from fusion.emulation.error_profile import TRANSLOCNET_KITTI, ErrorProfile
 from fusion.emulation.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
 from fusion.error_memory import ErrorMemory
@@ -183,10 +182,14 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
             since_m += float(np.hypot(*increment.delta[:2]))
         if since_m >= settings.measure_every_m:
             likelihood = emulator.measure(poses[frame], since_m)
-            temperature, memory = _weigh(particles, likelihood, settings.correlation(since_m), memory)
+            correlation = settings.correlation(since_m)
+            before = particles.estimate(stamp).covariance
+            temperature = memory.temperature(correlation, before)
+            report = particles.update(likelihood, temperature)
+            memory = memory.after(correlation, temperature, before, particles.estimate(stamp).covariance)
+            history.record(particles, stamp, report)
             mixtures.append(likelihood.modes(len(likelihood.weights)).tempered(temperature))
             answers[frame], since_m = likelihood.answer, 0.0
-            history.record(particles, stamp)
         else:
             mixtures.append(None)
             if frame == len(stamps) - 1:
@@ -211,16 +214,6 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
         "graph": summarise(poses, graph.poses, graph.covariances),
     }
     return EmulatedRun(profile.name, filtered, smoother, graph, single_shot, measured, metrics)
-
-
-def _weigh(
-    particles: ParticleFilter, likelihood: EmulatedLikelihood, correlation: float, memory: ErrorMemory
-) -> tuple[float, ErrorMemory]:
-    """Weigh by a measurement, flattened for what it repeats of the last one's error; by how much, and what is next."""
-    before = particles.estimate(0).covariance
-    temperature = memory.temperature(correlation, before)
-    particles.update(likelihood, temperature)
-    return temperature, memory.after(correlation, temperature, before, particles.estimate(0).covariance)
 
 
 def _placed(deltas: FloatArray, start: FloatArray) -> FloatArray:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -29,28 +26,12 @@ from sequences.search import Phase, SearchPlan
 from sequences.sequence import ScanError
 from sequences.snapshots import take_snapshot
 from sequences.start_cloud import MOST_MEASUREMENTS, StartCloud
+from sequences.stopwatch import Stopwatch
 from sequences.track_settings import TrackSettings
 from sequences.trajectory_io import format_seconds
 
 STAGES = ("scan", "match", "predict", "update")
 _FILTER_STREAM = 1
-
-
-@dataclass(slots=True)
-class Stopwatch:
-    """Milliseconds by stage."""
-
-    milliseconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Time what is inside as a stage."""
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            taken = 1e3 * (time.perf_counter() - begin)
-            self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + taken
 
 
 class FilterPass:

@@ -38,6 +38,22 @@ def _half_square(
 
 
 @numba.njit(cache=True, nogil=True)
+def motion_density(
+    particles: FloatArray, weights: FloatArray, later: FloatArray, delta: FloatArray, whiten: FloatArray
+) -> FloatArray:
+    """Density (M,), per m^2 rad, that particles of these weights and a motion give to each of `later` (M, 3)."""
+    cos, sin = np.cos(particles[:, 2]), np.sin(particles[:, 2])
+    scale = whiten[0, 0] * whiten[1, 1] * whiten[2, 2] / (2.0 * math.pi) ** 1.5
+    density = np.zeros(later.shape[0])
+    for m in range(later.shape[0]):
+        for i in range(particles.shape[0]):
+            half = _half_square(particles[i], cos[i], sin[i], later[m], delta, whiten)
+            density[m] += weights[i] * math.exp(-half) if half < _NEGLIGIBLE else 0.0
+        density[m] *= scale
+    return density
+
+
+@numba.njit(cache=True, nogil=True)
 def step_back(
     particles: FloatArray,
     weights: FloatArray,

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.kernels.float_math import KERNEL, F, sine_cosine
-from fusion.kernels.step import BLOCK, E0, E1, E2, SCRATCH_SIZE, three_normals
+from fusion.kernels.layout import BLOCK, E0, E1, E2, SCRATCH_SIZE
+from fusion.kernels.motion import three_normals
 
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 
@@ -28,7 +29,7 @@ def cells_of(
 
 
 @numba.njit(**_OPTIONS)
-def components(cells: NDArray[np.int64], size: int, cols: int, yaw_cells: int) -> tuple[NDArray[np.int64], int]:
+def components(cells: NDArray[Any], size: int, cols: int, yaw_cells: int) -> tuple[NDArray[Any], int]:
     """Label (N,) of each occupied cell in a grid of `size` cells, corners and the seam joined; and how many."""
     label_of = np.full(size, -1, np.int32)
     for cell in cells:
@@ -59,7 +60,7 @@ def components(cells: NDArray[np.int64], size: int, cols: int, yaw_cells: int) -
                             waiting[left] = near
                             left += 1
         count += 1
-    labels = np.empty(len(cells), np.int64)
+    labels = np.empty_like(cells)
     for i in range(len(cells)):
         labels[i] = label_of[cells[i]]
     return labels, count

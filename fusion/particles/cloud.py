@@ -5,96 +5,29 @@ the particles, which is that of the next measurement, or of whoever looks at the
 the key, on the number of the order and on the particle, so looking changes nothing.
 """
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from functools import cache
-from itertools import pairwise
-from math import cos, log, pi, remainder, sin, sqrt
+from math import cos, log, pi, sin, sqrt
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion.arrays import Float32Array, FloatArray
-from fusion.kernels.resample import block_masses, share_out, spread_blocks
-from fusion.kernels.step import (
-    BLOCK,
-    CENTRE,
-    DELTA,
-    KERNEL_ON,
-    KERNEL_ROOT,
-    LOG_SHIFT,
-    LOOKUP_SIZE,
-    MOTION_SIZE,
-    MOVED,
-    NOTHING,
-    REFERENCE_X,
-    ROOT,
-    SHIFT,
-    SHRINK,
-    SUMS,
-    combined,
-    step_blocks,
-)
-from fusion.particles.clusters import VARIANCE_FLOOR
+from fusion.kernels import layout as at
+from fusion.kernels.cloud_clusters import gather_copies
+from fusion.kernels.moments import arc_blocks, combined
+from fusion.kernels.step import step, step_blocks
 from fusion.particles.lookup import NO_SLOTS, NO_TABLE, Lookup
+from fusion.particles.moments import Moments, lower_root, wrapped
+from fusion.particles.regularisation import cluster_kernels, silverman_bandwidth
+from fusion.particles.shared_work import find_ancestors, share, sharers
 
 _REACH_M = 64.0  # the anchor follows the cloud when its mean is farther away
 _NOBODY = np.zeros(0, np.int32)
 _STAY = np.zeros(0)
-_NO_SHAPE = np.zeros(5, np.int64)
 _EQUAL = np.zeros(0)
-_ROUNDING = 1e-14
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="skyfix")
-
-
-def lower_root(covariance: list[list[float]]) -> list[float]:
-    """Lower triangular L, row by row (9,), with ``L L^T = covariance``; positive semidefinite will do."""
-    (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance
-    a = sqrt(xx) if xx > 0.0 else 0.0
-    b, c = (xy / a, xt / a) if a > 0.0 else (0.0, 0.0)
-    rest = yy - b * b
-    d = sqrt(rest) if rest > _ROUNDING * yy else 0.0
-    e = (yt - b * c) / d if d > 0.0 else 0.0
-    rest = tt - c * c - e * e
-    return [a, 0.0, 0.0, b, d, 0.0, c, e, sqrt(rest) if rest > _ROUNDING * tt else 0.0]
-
-
-def positive_definite(covariance: list[list[float]], factor: float) -> FloatArray:
-    """A covariance (3, 3) times a factor, plus 1 mm and 0.1 mrad squared; rounding below zero is taken away."""
-    result = np.array(covariance) * factor + VARIANCE_FLOOR
-    root = lower_root(result.tolist())
-    if min(root[0], root[4], root[8]) > 0.0:
-        return result
-    values, vectors = np.linalg.eigh(result)
-    return (vectors * np.maximum(values, VARIANCE_FLOOR[2, 2])) @ vectors.T
-
-
-def _wrapped(angle: float) -> float:
-    return angle if -pi <= angle < pi else remainder(angle, 2.0 * pi) if remainder(angle, 2.0 * pi) < pi else -pi
-
-
-@dataclass(frozen=True, slots=True)
-class Moments:
-    """Sums over a weighted cloud.
-
-    Parameters
-    ----------
-    effective_sample_size : float
-        ``(sum w)^2 / sum w^2``.
-    mean : tuple of 3 floats
-        x, y relative to the anchor, yaw wrapped and circular.
-    covariance : list of 3 lists of 3 floats
-        About the mean, without a correction for the sample's size.
-    """
-
-    effective_sample_size: float
-    mean: tuple[float, float, float]
-    covariance: list[list[float]]
+_STILL = [0.0] * at.MOTION_SIZE
+_NOT_WEIGHED = [0.0] * at.WEIGH_SIZE
+_WHOLE_CIRCLE = pi - 1e-5
 
 
 class Cloud:
@@ -133,8 +66,9 @@ class Cloud:
         self._log_weights = _EQUAL if log_weights is None else log_weights - log_weights.max()
         self._shift = 0.0
         self._ancestors = _NOBODY
-        self._motion: FloatArray | None = None
-        self._sums = np.zeros((0, SUMS))
+        self._labels, self._clusters = _NOBODY, NO_TABLE
+        self._motion: list[float] | None = None
+        self._sums = np.zeros((0, at.SUMS))
         self._reference = (0.0, 0.0, float(poses[0, 2]))
         self._moments: Moments | None = self._pass(None, 0.0)
         self._reference = self._moments.mean
@@ -193,12 +127,12 @@ class Cloud:
 
     def move(self, delta: list[float], covariance: list[list[float]]) -> None:
         """Order a motion: an increment and its covariance, on the axes of every particle's body."""
-        if self._motion is not None and self._motion[MOVED] > 0.0:
+        if self._motion is not None and self._motion[at.MOVED] > 0.0:
             self._settle()
         motion = self._order()
-        motion[DELTA : DELTA + 3] = delta
-        motion[ROOT : ROOT + 9] = lower_root(covariance)
-        motion[MOVED] = 1.0
+        motion[at.DELTA : at.DELTA + 3] = delta
+        motion[at.ROOT : at.ROOT + 9] = lower_root(covariance)
+        motion[at.MOVED] = 1.0
         self._moments = None
 
     def weigh(self, lookup: Lookup, outlier_probability: float) -> float:
@@ -224,12 +158,8 @@ class Cloud:
         self._settle()
         if len(self._log_weights) == 0:
             self._log_weights = np.zeros(self._count)
-        blocks = len(self._sums)
-        masses, edges = np.empty(blocks), np.empty(blocks + 1)
         ancestors = self._buffer("ancestors", count, np.int32)
-        self._share(block_masses, blocks, self._log_weights, self._sums, masses)
-        share_out(self._sums, masses, count, edges)
-        self._share(spread_blocks, blocks, self._log_weights, self._sums, masses, edges, offset, ancestors)
+        find_ancestors(self._threads, self._log_weights, self._sums, offset, ancestors)
         self.keep(ancestors)
 
     def keep(self, ancestors: NDArray[np.int32]) -> None:
@@ -244,14 +174,28 @@ class Cloud:
     def regularise(self, width: float) -> None:
         """Order kernel noise of `width` standard deviations, with shrinkage, on top of resampling."""
         moments, motion = self.moments(), self._order()
-        motion[CENTRE : CENTRE + 3] = moments.mean
-        motion[SHRINK] = sqrt(1.0 - width * width)
-        motion[KERNEL_ROOT : KERNEL_ROOT + 9] = [width * value for value in lower_root(moments.covariance)]
-        motion[KERNEL_ON] = 1.0
+        motion[at.CENTRE : at.CENTRE + 3] = moments.mean
+        motion[at.SHRINK] = sqrt(1.0 - width * width)
+        motion[at.KERNEL_ROOT : at.KERNEL_ROOT + 9] = [width * value for value in lower_root(moments.covariance)]
+        motion[at.KIND] = at.ONE_KERNEL
 
-    def _order(self) -> FloatArray:
+    def regularise_in_clusters(self, scale: float) -> None:
+        """Order kernel noise of `scale` times Silverman's bandwidth for each cluster of what resampling has kept."""
+        if len(self._ancestors):
+            gathered = self._buffer("cloud", 3 * self._count, np.float32)
+            gather_copies(self._xyt, self._ancestors, gathered)
+            self._spare["cloud"], self._xyt = self._xyt, gathered
+            self._spare["ancestors"], self._ancestors = self._ancestors, _NOBODY
+        found = cluster_kernels(self._xyt, scale)
+        if found is None:
+            self.regularise(scale * silverman_bandwidth(self._count, 3))
+        else:
+            self._labels, self._clusters = found
+            self._order()[at.KIND] = at.CLUSTER_KERNELS
+
+    def _order(self) -> list[float]:
         if self._motion is None:
-            self._motion = np.zeros(MOTION_SIZE)
+            self._motion = _STILL.copy()
         return self._motion
 
     def _settle(self) -> None:
@@ -263,93 +207,87 @@ class Cloud:
 
     def _pass(self, lookup: Lookup | None, outlier_probability: float) -> Moments:
         """Carry out the orders in one pass, weigh if there is a lookup, and give the moments."""
-        source, ancestors = self._xyt, self._ancestors
-        motion = self._order() if len(ancestors) else self._motion
-        cloud = source
-        if motion is not None:
-            self._go_on(motion)
-            cloud = self._buffer("cloud", 3 * self._count, np.float32)
+        source, ancestors, before = self._xyt, self._ancestors, self._log_weights
+        order = self._order() if len(ancestors) else self._motion
+        cloud, motion = source, _STAY
+        if order is not None:
+            self._go_on(order)
+            cloud, motion = self._buffer("cloud", 3 * self._count, np.float32), np.array(order)
         out = self._buffer("log weights", self._count, np.float64)
-        look = np.zeros(LOOKUP_SIZE) if lookup is None else lookup.arguments(self._anchor, outlier_probability)
-        look[LOG_SHIFT] = self._shift
-        look[REFERENCE_X : REFERENCE_X + 3] = self._reference
-        self._step(source, ancestors, _STAY if motion is None else motion, cloud, lookup, look, out)
-        if motion is not None:
+        weigh = _NOT_WEIGHED if lookup is None else lookup.arguments(self._anchor, outlier_probability)
+        look = np.array((*weigh, *self._reference, self._shift))
+        sums = self._step(source, motion, cloud, lookup, look, out)
+        if order is not None:
             self._spare["cloud"], self._xyt = source, cloud
-            self._spare["ancestors"] = ancestors
-            self._epoch += int(motion[MOVED] > 0.0)
-        self._ancestors, self._motion = _NOBODY, None
-        if lookup is not None or len(self._log_weights):
-            self._spare["log weights"], self._log_weights = self._log_weights, out
+            if len(ancestors):
+                self._spare["ancestors"] = ancestors
+            self._epoch += order[at.MOVED] > 0.0
+            self._ancestors = self._labels = _NOBODY
+            self._clusters, self._motion = NO_TABLE, None
+        if lookup is not None or len(before):
+            self._spare["log weights"], self._log_weights = before, out
         else:
             self._spare["log weights"] = out
-        return self._summary(look)
+        return self._summary(sums, weigh, look)
 
-    def _go_on(self, motion: FloatArray) -> None:
+    def _go_on(self, motion: list[float]) -> None:
         """Move the reference pose along, and the anchor when the cloud has left it behind."""
         x, y, yaw = self._reference
-        dx, dy, turn = motion[DELTA : DELTA + 3].tolist()
-        east, north = (float(round(at)) if abs(at) > _REACH_M else 0.0 for at in (x, y))
-        motion[SHIFT : SHIFT + 2] = east, north
-        self._anchor = (self._anchor[0] + east, self._anchor[1] + north)
+        dx, dy, turn = motion[at.DELTA : at.DELTA + 3]
+        if abs(x) > _REACH_M or abs(y) > _REACH_M:
+            east, north = (float(round(at)) if abs(at) > _REACH_M else 0.0 for at in (x, y))
+            motion[at.SHIFT : at.SHIFT + 2] = east, north
+            self._anchor = (self._anchor[0] + east, self._anchor[1] + north)
+            x, y = x - east, y - north
+            if self._moments is not None:
+                mean = self._moments.mean
+                self._moments = self._moments._replace(mean=(mean[0] - east, mean[1] - north, mean[2]))
         along, across = cos(yaw), sin(yaw)
-        x, y = x - east + along * dx - across * dy, y - north + across * dx + along * dy
-        self._reference = (x, y, _wrapped(yaw + turn))
-        if self._moments is not None and (east or north):
-            x, y, yaw = self._moments.mean
-            self._moments = replace(self._moments, mean=(x - east, y - north, yaw))
+        self._reference = (x + along * dx - across * dy, y + across * dx + along * dy, wrapped(yaw + turn))
 
     def _step(
         self,
         source: Float32Array,
-        ancestors: NDArray[np.int32],
         motion: FloatArray,
         cloud: Float32Array,
         lookup: Lookup | None,
         look: FloatArray,
         out: FloatArray,
-    ) -> None:
-        blocks = -(-self._count // BLOCK)
+    ) -> tuple[float, ...]:
+        blocks = -(-self._count // at.BLOCK)
         if len(self._sums) != blocks:
-            self._sums = np.zeros((blocks, SUMS))
+            self._sums = np.zeros((blocks, at.SUMS))
+        ordered = (source, self._ancestors, self._labels, self._clusters, motion, self._key, self._epoch, cloud)
         weigh = (
-            (NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS, _NO_SHAPE)
+            (at.NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS)
             if lookup is None
-            else (lookup.mode, lookup.table, lookup.location, lookup.slots, lookup.shape())
+            else (lookup.mode, lookup.table, lookup.location, lookup.slots)
         )
-        moved = (source, ancestors, motion, self._key, np.uint32(self._epoch), cloud)
-        self._share(step_blocks, blocks, *moved, *weigh, look, self._log_weights, out, self._sums)
+        if sharers(self._threads, blocks) == 1:
+            return step(*ordered, *weigh, look, self._log_weights, out, self._sums)
+        share(self._threads, step_blocks, blocks, *ordered, *weigh, look, self._log_weights, out, self._sums)
+        return combined(self._sums, look)
 
-    def _summary(self, look: FloatArray) -> Moments:
+    def _summary(self, sums: tuple[float, ...], weigh: list[float], look: FloatArray) -> Moments:
         """Moments from the sums; about the mean itself where the reference was too far from it to be accurate."""
-        x, y, yaw = look[REFERENCE_X : REFERENCE_X + 3].tolist()
-        sums = combined(self._sums, look).tolist()
-        far_off = (sums[3] - x) ** 2 > 1e3 * sums[6] or (sums[4] - y) ** 2 > 1e3 * sums[8]
-        if far_off or sums[12] + abs(sums[5] - yaw) >= pi - 1e-5:
-            look[REFERENCE_X : REFERENCE_X + 3] = sums[3], sums[4], _wrapped(sums[5])
-            look[LOG_SHIFT] = 0.0
-            out = self._log_weights if len(self._log_weights) else self._buffer("log weights", self._count, np.float64)
-            self._step(self._xyt, _NOBODY, _STAY, self._xyt, None, look, out)
-            if len(self._log_weights) == 0:
+        x, y, yaw = self._reference
+        if (sums[3] - x) ** 2 > 1e3 * sums[6] or (sums[4] - y) ** 2 > 1e3 * sums[8]:
+            x, y, yaw = self._reference = sums[3], sums[4], wrapped(yaw + sums[5])
+            look = np.array((*weigh, x, y, yaw, 0.0))
+            weights = self._log_weights
+            out = weights if len(weights) else self._buffer("log weights", self._count, np.float64)
+            sums = self._step(self._xyt, _STAY, self._xyt, None, look, out)
+            if len(weights) == 0:
                 self._spare["log weights"] = out
-            sums = combined(self._sums, look).tolist()
-        largest, self._log_total, size, x, y, yaw, xx, xy, yy, xt, yt, tt, _ = sums
+        if sums[12] + abs(sums[5]) >= _WHOLE_CIRCLE:
+            low, high = (-4.0, sums[5] - pi) if sums[5] > 0.0 else (sums[5] + pi, 4.0)
+            share(self._threads, arc_blocks, len(self._sums), self._xyt, self._log_weights, look, low, high, self._sums)
+            sums = combined(self._sums, look)
+        largest, self._log_total, size, x, y, turned, xx, xy, yy, xt, yt, tt, _ = sums
         self._shift = largest if len(self._log_weights) else 0.0
-        return Moments(size, (x, y, _wrapped(yaw)), [[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+        return Moments(size, (x, y, wrapped(yaw + turned)), [[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
 
     def _buffer(self, name: str, size: int, kind: Any) -> NDArray[Any]:
         """Memory that was used before, when it has the right size: fresh memory costs more than the step."""
         spare = self._spare.pop(name, None)
         return spare if spare is not None and len(spare) == size else np.empty(size, kind)
-
-    def _share(self, kernel: Any, blocks: int, *arguments: Any) -> None:
-        """Run a kernel over all blocks, on several threads when that pays."""
-        threads = min(self._threads, blocks // 4)
-        if threads <= 1:
-            kernel(0, blocks, *arguments)
-            return
-        edges = [blocks * part // threads for part in range(threads + 1)]
-        work = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in pairwise(edges[1:])]
-        kernel(edges[0], edges[1], *arguments)
-        for each in work:
-            each.result()

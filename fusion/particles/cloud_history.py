@@ -6,8 +6,8 @@
         particles.predict(increment)
         history.move(increment)
         ...                                      # at some of the stamps:
-        particles.update(likelihood)
-        history.record(particles, increment.stamp_ns)
+        report = particles.update(likelihood)
+        history.record(particles, increment.stamp_ns, report)
 
 Every update has to be followed by a record, with no odometry in between: a smoother that goes back over two updates in
 one step would have to know both likelihoods. A filter resamples inside its update, so a recorded cloud may be resampled
@@ -18,7 +18,8 @@ the particles kept times the records.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import exp
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +28,7 @@ from fusion import se2
 from fusion.arrays import FloatArray, checked, read_only
 from fusion.errors import SkyfixError
 from fusion.odometry import OdometryIncrement
+from fusion.pose_filter import UpdateReport
 from fusion.resampling import systematic
 
 
@@ -56,11 +58,14 @@ class RecordedCloud:
         Poses.
     weights : (N,) float64
         Sum 1.
+    jump_density : float
+        With which a pose may have come from anywhere, beside the odometry's density; 0 when it cannot have.
     """
 
     stamp_ns: int
     particles: FloatArray
     weights: FloatArray
+    jump_density: float = 0.0
 
 
 class CloudHistory:
@@ -116,8 +121,17 @@ class CloudHistory:
             raise SkyfixError(f"increment: expected a stamp after {last} ns, got {increment.stamp_ns} ns")
         self._pending.append(increment)
 
-    def record(self, cloud: WeightedCloud, stamp_ns: int) -> None:
+    def record(self, cloud: WeightedCloud, stamp_ns: int, report: UpdateReport | None = None) -> None:
         """Keep the filter's cloud at a stamp; at the stamp of the last record, keep it in its place.
+
+        Parameters
+        ----------
+        cloud : WeightedCloud
+            The filter.
+        stamp_ns : int
+            When.
+        report : UpdateReport, optional
+            Of the measurement at this stamp. Without it a smoother takes every particle for one that odometry moved.
 
         Raises
         ------
@@ -129,9 +143,10 @@ class CloudHistory:
             expected = self._clouds[-1].stamp_ns
         if expected is not None and stamp_ns != expected:
             raise SkyfixError(f"history: expected the stamp of the last increment, {expected} ns, got {stamp_ns} ns")
-        recorded = self._thinned(cloud, stamp_ns)
+        recorded = replace(self._thinned(cloud, stamp_ns), jump_density=exp(report.log_jump_density) if report else 0.0)
         if self._clouds and not self._pending:
-            self._clouds[-1] = recorded
+            before = self._clouds[-1].jump_density
+            self._clouds[-1] = replace(recorded, jump_density=before + recorded.jump_density)
             return
         if self._pending:
             self._motions.append(self._pending)

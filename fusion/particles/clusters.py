@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from fusion import se2
-from fusion.arrays import FloatArray, IntArray
+from fusion.arrays import Float32Array, FloatArray, IntArray
 from fusion.gaussian_mixture import GaussianMixture
+from fusion.kernels.cloud_clusters import cells_of_cloud, extent
 from fusion.kernels.clusters import cells_of, components, moments_of
 
 CELL_M = 2.0
@@ -71,6 +73,18 @@ def _labels(poses: FloatArray) -> tuple[IntArray, int]:
     if size <= _MOST_CELLS:
         return components(cells, size, cols, _YAW_CELLS)
     return _sparse_components(cells, cols)
+
+
+def cloud_labels(cloud: Float32Array) -> tuple[NDArray[np.int32], int]:
+    """Cluster (N,) of each particle of a cloud as the compiled step keeps it (3 N,), and their number."""
+    count = len(cloud) // 3
+    (x0, x1), (y0, y1) = extent(cloud[:count]), extent(cloud[count : 2 * count])
+    rows, cols = int((x1 - x0) / CELL_M) + 3, int((y1 - y0) / CELL_M) + 3
+    size = rows * cols * _YAW_CELLS
+    if size <= _MOST_CELLS:
+        return components(cells_of_cloud(cloud, x0, y0, CELL_M, cols, _YAW_CELLS), size, cols, _YAW_CELLS)
+    labels, clusters = _labels(np.ascontiguousarray(cloud.reshape(3, -1).T, dtype=np.float64))
+    return labels.astype(np.int32), clusters
 
 
 def _sparse_components(cell_of: IntArray, cols: int) -> tuple[IntArray, int]:

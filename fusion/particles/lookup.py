@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray, read_only
 from fusion.grid import MapGrid
-from fusion.kernels.step import LOOKUP_SIZE, MAPS, VOLUME
+from fusion.kernels.layout import MAPS, VOLUME
 
 MOST_CELLS = 2**31 - 1
 """Cells are counted in 32 bits."""
@@ -25,7 +25,7 @@ NO_TABLE = read_only(np.zeros(0, np.float32))
 NO_SLOTS = read_only(np.zeros(0, np.int32))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)  # made once a measurement: a frozen one takes twice as long to make
 class Lookup:
     """Log densities of cells, and how to temper them.
 
@@ -62,30 +62,25 @@ class Lookup:
     bin_stride: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("table", "location", "slots"):  # one kind of array, or the step is compiled once more
-            if getattr(self, name).flags.writeable:
-                object.__setattr__(self, name, read_only(getattr(self, name)))
+        if self.table.flags.writeable or self.location.flags.writeable or self.slots.flags.writeable:
+            for name in ("table", "location", "slots"):  # one kind of array, or the step is compiled once more
+                setattr(self, name, read_only(getattr(self, name)))
 
     @property
     def mode(self) -> int:
         """Which of the compiled functions reads it."""
         return MAPS if len(self.location) else VOLUME
 
-    def shape(self) -> NDArray[np.int64]:
-        """The whole numbers of the compiled step."""
-        return np.array((self.grid.rows, self.grid.cols, self.bins, self.pixel_stride, self.bin_stride), np.int64)
-
-    def arguments(self, anchor: tuple[float, float], outlier_probability: float) -> FloatArray:
-        """The other numbers of the compiled step, for positions relative to `anchor`."""
+    def arguments(self, anchor: tuple[float, float], outlier_probability: float) -> list[float]:
+        """The numbers of the compiled step, for positions relative to `anchor`."""
         grid, p = self.grid, outlier_probability
-        per_m = 1.0 / grid.metres_per_pixel
+        rows, per_m = grid.rows, 1.0 / grid.metres_per_pixel
         west, south = anchor[0] - grid.x0, anchor[1] - grid.y0
-        arguments = np.zeros(LOOKUP_SIZE)
-        arguments[:11] = (
-            *(per_m, west * per_m, -per_m, grid.rows - south * per_m, self.bins / se2.TWO_PI),
+        return [
+            *(per_m, west * per_m, -per_m, rows - south * per_m, self.bins / se2.TWO_PI),
             *(self.scale, self.shift, self.floor_before, self.floor, 1.0 - p, p / (grid.area_m2 * se2.TWO_PI)),
-        )
-        return arguments
+            *(rows, grid.cols, self.bins, self.pixel_stride, self.bin_stride),
+        ]
 
 
 def lookup_of(likelihood: object, temperature: float, poses: Callable[[], FloatArray]) -> Lookup | None:

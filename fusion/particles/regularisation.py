@@ -13,10 +13,12 @@ Silverman, "Density estimation for statistics and data analysis", 1986, equation
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fusion.arrays import FloatArray
+from fusion.arrays import Float32Array, FloatArray
+from fusion.kernels.cloud_clusters import cloud_moments, cluster_rows
 from fusion.kernels.clusters import spread_in_clusters
-from fusion.particles.clusters import CELL_M, CELL_RAD, find_clusters
+from fusion.particles.clusters import CELL_M, CELL_RAD, cloud_labels, find_clusters
 
 FloatOrArray = TypeVar("FloatOrArray", float, FloatArray)
 
@@ -48,3 +50,24 @@ def regularised(particles: FloatArray, scale: float, rng: np.random.Generator) -
     key = rng.integers(2**32, size=4, dtype=np.uint32)
     particles = np.ascontiguousarray(particles)
     return spread_in_clusters(particles, clusters.labels, clusters.means, roots, widths, key)
+
+
+def cluster_kernels(cloud: Float32Array, scale: float) -> tuple[NDArray[np.int32], Float32Array] | None:
+    """The kernels of a cloud as the compiled step keeps it, see `fusion.kernels.cloud_clusters`.
+
+    Parameters
+    ----------
+    cloud : (3 N,) float32
+        x, y and yaw of equally weighted particles.
+    scale : float
+        Of Silverman's bandwidth, 0 < scale <= 1.
+
+    Returns
+    -------
+    Cluster (N,) of each particle and the clusters' rows for the step; None when all particles are one cluster.
+    """
+    labels, clusters = cloud_labels(cloud)
+    if clusters == 1:
+        return None
+    number, means, squares = cloud_moments(cloud, labels, clusters)
+    return labels, cluster_rows(means, squares, scale * silverman_bandwidth(number, 3))

@@ -1,0 +1,51 @@
+"""Compiled work on the blocks of a cloud, shared among threads when that pays; the result does not depend on it."""
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.arrays import FloatArray
+from fusion.kernels.resample import block_masses, resample_blocks, share_out, spread_blocks
+
+_LEAST_BLOCKS = 4  # a thread
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="skyfix")
+
+
+def sharers(threads: int, blocks: int) -> int:
+    """How many of some threads are worth having for so many blocks."""
+    return 1 if threads == 1 else max(1, min(threads, blocks // _LEAST_BLOCKS))
+
+
+def share(threads: int, kernel: Any, blocks: int, *arguments: Any) -> None:
+    """Run a kernel ``(first, last, *arguments)`` over all blocks."""
+    threads = sharers(threads, blocks)
+    if threads == 1:
+        kernel(0, blocks, *arguments)
+        return
+    edges = [blocks * part // threads for part in range(threads + 1)]
+    work = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in pairwise(edges[1:])]
+    kernel(edges[0], edges[1], *arguments)
+    for each in work:
+        each.result()
+
+
+def find_ancestors(
+    threads: int, log_weights: FloatArray, sums: FloatArray, offset: float, ancestors: NDArray[np.int32]
+) -> None:
+    """Fill in the ancestors (n,) of systematic resampling, see `fusion.kernels.resample`."""
+    blocks = len(sums)
+    if sharers(threads, blocks) == 1:
+        resample_blocks(log_weights, sums, offset, ancestors)
+        return
+    masses, edges = np.empty(blocks), np.empty(blocks + 1)
+    share(threads, block_masses, blocks, log_weights, sums, masses)
+    share_out(sums, masses, len(ancestors), edges)
+    share(threads, spread_blocks, blocks, log_weights, sums, masses, edges, offset, ancestors)
