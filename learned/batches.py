@@ -91,9 +91,15 @@ def training_batches(
         num_workers=workers,
         prefetch_factor=8 if workers else None,
         worker_init_fn=_end_with_parent,
+        multiprocessing_context=_context() if workers else None,
     )
     for examples in loader:
         yield Batch.of(examples, steps.offset)
+
+
+def _context() -> str | None:
+    """How workers start: as the platform does, but never as a fork of a process with OpenVINO, which dies of it."""
+    return "forkserver" if "openvino" in sys.modules and sys.platform == "linux" else None
 
 
 def _end_with_parent(worker: int) -> None:

@@ -1,15 +1,15 @@
-"""What the commands of `skyfix` have in common: options, opening a sequence, the line of a training step."""
+"""What the commands of `skyfix` have in common: options, the line of a training step, writing files."""
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    pass
+from fusion.errors import SkyfixError
 
 MatcherOption = Annotated[
     str,
@@ -87,3 +87,24 @@ def training_line(step: int, steps: int, loss: float, validation: float | None) 
     if step % 50 == 0 or step == steps:
         held_out = "" if validation is None else f", validation {validation:.3f}"
         print(f"step {step}/{steps}: loss {loss:.3f}{held_out}", file=sys.stderr)
+
+
+def write_json(path: Path | None, content: object) -> None:
+    """Write to a file that an option named, if it did.
+
+    Raises
+    ------
+    SkyfixError
+        If it cannot be written.
+    """
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def write_text(path: Path | None, content: str) -> None:
+    """As `write_json`, text as it is."""
+    if path is None:
+        return
+    try:
+        path.write_text(content, encoding="utf-8")
+    except OSError as error:
+        raise SkyfixError(f"{path}: cannot be written: {error.strerror}") from error

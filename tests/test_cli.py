@@ -21,7 +21,8 @@ import sequences.localize
 import sequences.progress
 import sequences.train_command
 from fusion.errors import SkyfixError
-from sequences.cli import app, default_odometry, main
+from sequences.cli import app, main
+from sequences.cli_track import default_odometry
 from sequences.folder import FolderSequence
 from sequences.progress import ConsoleProgress
 from sequences.run_result import FrameRow

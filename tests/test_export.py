@@ -12,16 +12,19 @@ import numpy as np
 import pytest
 import torch
 from landmark_scenes import BEV, Scene, matched, scene
+from landmarks import Landmarks
 from made_drive import MadeDrive
 
 from fusion.errors import SkyfixError
 from learned.backends import BACKENDS, Backend, first_installed
+from learned.batches import training_batches
 from learned.calibration import Calibration
 from learned.export import export
 from learned.exported import ExportedRotMatch, load_exported
 from learned.geometric import GeometricMatcher
 from learned.matcher import SearchRegion, load_matcher
 from learned.rotmatch import RotMatch, RotMatchNet, RotMatchSettings
+from learned.training_settings import TrainingSettings
 from learned.voting_net import VotingMatcher
 from sequences.cli import main
 from sequences.folder import FolderSequence
@@ -242,3 +245,11 @@ def test_images_are_of_as_many_scans_as_asked_for(made_drive: MadeDrive) -> None
         assert picture.shape == (3, 144, 144)
     with pytest.raises(SkyfixError, match="frames: expected >= 1, got 0"):
         matched_images(drive, matcher, 0)
+
+
+def test_training_goes_on_with_workers_where_openvino_has_run(folder: Path) -> None:
+    pytest.importorskip("openvino", reason="openvino is not installed")
+    matched(load_exported(folder, "openvino"), scene(0))
+    settings = TrainingSettings(steps=3, batch=2, workers=1)
+    batches = list(training_batches(Landmarks(4), settings, first=0))
+    assert len(batches) == 3
