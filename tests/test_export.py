@@ -249,7 +249,7 @@ def test_images_are_of_as_many_scans_as_asked_for(made_drive: MadeDrive) -> None
 
 def test_training_goes_on_with_workers_where_openvino_has_run(folder: Path) -> None:
     pytest.importorskip("openvino", reason="openvino is not installed")
-    matched(load_exported(folder, "openvino"), scene(0))
+    matched(load_exported(folder, BACKENDS["openvino"]), scene(0))
     settings = TrainingSettings(steps=3, batch=2, workers=1)
     batches = list(training_batches(Landmarks(4), settings, first=0))
     assert len(batches) == 3
