@@ -136,15 +136,3 @@ def spread_blocks(
         for k in range(low, high):
             largest = max(largest, ancestors[k])
             ancestors[k] = largest
-
-
-@numba.njit(**KERNEL)
-def resample_blocks(
-    log_weights: NDArray[np.float64], sums: NDArray[np.float64], offset: float, ancestors: NDArray[np.int32]
-) -> None:
-    """All of it on one thread: `block_masses`, `share_out` and `spread_blocks` in one call."""
-    blocks = len(sums)
-    masses, edges = np.empty(blocks), np.empty(blocks + 1)
-    block_masses(0, blocks, log_weights, sums, masses)
-    share_out(sums, masses, len(ancestors), edges)
-    spread_blocks(0, blocks, log_weights, sums, masses, edges, offset, ancestors)

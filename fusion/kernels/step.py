@@ -29,7 +29,7 @@ from fusion.kernels.layout import (
     Float64s,
     Int32s,
 )
-from fusion.kernels.moments import block_moments, combined
+from fusion.kernels.moments import block_moments
 from fusion.kernels.motion import advance, fetch, regularise, regularise_in_clusters, six_normals, three_normals
 from fusion.kernels.weigh import weigh_by_maps, weigh_by_volume
 
@@ -114,46 +114,3 @@ def step_blocks(
             for j in range(n):
                 s[ADDED + j] = F(0)
         block_moments(start, n, log_weights, out, look, s, sums[block])
-
-
-@numba.njit(**KERNEL)
-def step(
-    source: Float32s,
-    ancestors: Int32s,
-    labels: Int32s,
-    clusters: Float32s,
-    motion: Float64s,
-    key: NDArray[np.uint32],
-    epoch: int,
-    cloud: Float32s,
-    mode: int,
-    table: Float32s,
-    location: Float32s,
-    slots: Int32s,
-    look: Float64s,
-    log_weights: Float64s,
-    out: Float64s,
-    sums: Float64s,
-) -> tuple[float, ...]:
-    """All blocks on one thread, and `fusion.kernels.moments.combined` of their sums: one call instead of two."""
-    step_blocks(
-        0,
-        len(sums),
-        source,
-        ancestors,
-        labels,
-        clusters,
-        motion,
-        key,
-        epoch,
-        cloud,
-        mode,
-        table,
-        location,
-        slots,
-        look,
-        log_weights,
-        out,
-        sums,
-    )
-    return combined(sums, look)

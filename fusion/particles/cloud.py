@@ -15,11 +15,11 @@ from fusion.arrays import Float32Array, FloatArray
 from fusion.kernels import layout as at
 from fusion.kernels.cloud_clusters import gather_copies
 from fusion.kernels.moments import arc_blocks, combined
-from fusion.kernels.step import step, step_blocks
+from fusion.kernels.step import step_blocks
 from fusion.particles.lookup import NO_SLOTS, NO_TABLE, Lookup
 from fusion.particles.moments import Moments, lower_root, wrapped
 from fusion.particles.regularisation import cluster_kernels, silverman_bandwidth
-from fusion.particles.shared_work import find_ancestors, share, sharers
+from fusion.particles.shared_work import find_ancestors, share
 
 _REACH_M = 64.0  # the anchor follows the cloud when its mean is farther away
 _NOBODY = np.zeros(0, np.int32)
@@ -263,8 +263,6 @@ class Cloud:
             if lookup is None
             else (lookup.mode, lookup.table, lookup.location, lookup.slots)
         )
-        if sharers(self._threads, blocks) == 1:
-            return step(*ordered, *weigh, look, self._log_weights, out, self._sums)
         share(self._threads, step_blocks, blocks, *ordered, *weigh, look, self._log_weights, out, self._sums)
         return combined(self._sums, look)
 

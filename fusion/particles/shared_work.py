@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.arrays import FloatArray
-from fusion.kernels.resample import block_masses, resample_blocks, share_out, spread_blocks
+from fusion.kernels.resample import block_masses, share_out, spread_blocks
 
 _LEAST_BLOCKS = 4  # a thread
 
@@ -19,14 +19,12 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="skyfix")
 
 
-def sharers(threads: int, blocks: int) -> int:
-    """How many of some threads are worth having for so many blocks."""
-    return 1 if threads == 1 else max(1, min(threads, blocks // _LEAST_BLOCKS))
-
-
 def share(threads: int, kernel: Any, blocks: int, *arguments: Any) -> None:
-    """Run a kernel ``(first, last, *arguments)`` over all blocks."""
-    threads = sharers(threads, blocks)
+    """Run a kernel ``(first, last, *arguments)`` over all blocks, on as many of some threads as are worth having.
+
+    One thread calls the kernel that several call: inlined into another kernel, it may be compiled to other roundings.
+    """
+    threads = max(1, min(threads, blocks // _LEAST_BLOCKS))
     if threads == 1:
         kernel(0, blocks, *arguments)
         return
@@ -42,9 +40,6 @@ def find_ancestors(
 ) -> None:
     """Fill in the ancestors (n,) of systematic resampling, see `fusion.kernels.resample`."""
     blocks = len(sums)
-    if sharers(threads, blocks) == 1:
-        resample_blocks(log_weights, sums, offset, ancestors)
-        return
     masses, edges = np.empty(blocks), np.empty(blocks + 1)
     share(threads, block_masses, blocks, log_weights, sums, masses)
     share_out(sums, masses, len(ancestors), edges)
