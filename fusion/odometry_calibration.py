@@ -15,13 +15,14 @@ MacKay, "Bayesian interpolation", 1992 (evidence).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
+from fusion.errors import SkyfixError
 from fusion.graph.assembly import pose_graph
 from fusion.graph.chain import Chain
 from fusion.graph.measurements import Measurement, Measurements
@@ -64,6 +65,11 @@ class OdometryCalibration:
         Its noise over what was assumed, factors of standard deviations.
     scale_walk : float
         How its scale wanders over what was assumed, likewise.
+
+    Raises
+    ------
+    SkyfixError
+        When a value is not finite, or a factor not positive.
     """
 
     clock_offset_s: float = 0.0
@@ -76,6 +82,13 @@ class OdometryCalibration:
     across_noise: float = 1.0
     heading_noise: float = 1.0
     scale_walk: float = 1.0
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value, factor = getattr(self, entry.name), entry.default == 1.0
+            if not np.isfinite(value) or (factor and value <= 0.0):
+                expected = "a positive number" if factor else "a finite number"
+                raise SkyfixError(f"odometry calibration {entry.name}: expected {expected}, got {value}")
 
     def corrected(self, odometry: Trajectory) -> Trajectory:
         """The odometry of the vehicle's body, carried on at both ends as it last moved."""
@@ -176,6 +189,7 @@ def calibrate_odometry(
         As for `fusion.factor_graph.smooth`.
     settings : SmootherSettings
         As there; its drift is what is assumed of how scale, mounting and heading bias change, the default when None.
+        For a filter, which cannot follow such changes, find the noise with `OdometryDrift.steady`.
     calibration_prior : CalibrationPrior
         What errors are usual.
 

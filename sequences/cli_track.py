@@ -83,6 +83,14 @@ def track(
         typer.Option(help="How far the matcher's errors stay alike, metres. Default: the matcher's own.", metavar="M"),
     ] = None,
     watch_map_every: WatchMapOption = 0.0,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="Correct the odometry by what an earlier run with it has found, clock, mounting, scale and noise. "
+            "Default: the filter takes it as it comes; the smoother finds its errors by itself.",
+            metavar="RUN",
+        ),
+    ] = None,
     map_error_m: Annotated[
         float, typer.Option(help="How far off the map draws things, standard deviation, metres.", metavar="M")
     ] = 0.4,
@@ -96,6 +104,7 @@ def track(
     Writes a run directory (metrics.json, report.html, trajectories) and prints the errors, when there is ground truth.
     """
     from sequences.registry import OpenOptions, open_sequence
+    from sequences.run_files import read_calibration
     from sequences.track_settings import TrackSettings
 
     opened = open_sequence(sequence, OpenOptions(seed, allow_pickle))
@@ -112,6 +121,7 @@ def track(
         correlation_length_m=correlation_length_m,
         map_error_m=map_error_m,
         map_check_every_m=watch_map_every,
+        calibration=None if calibration is None else read_calibration(calibration),
     )
     _run(opened, matcher, settings, out, overwrite, quiet, backend)
 

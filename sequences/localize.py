@@ -13,14 +13,14 @@ from typing import Protocol
 
 import numpy as np
 
-from fusion.factor_graph import SmootherSettings
-from fusion.odometry import increments_at
+from fusion.factor_graph import OdometryDrift, SmootherSettings
+from fusion.odometry import OdometryIncrement, increments_at
 from fusion.trajectory import Trajectory
 from learned.matcher import MapMatcher
-from sequences.drive import Drive, load_drive, place_odometry
+from sequences.drive import STAMP_TOLERANCE_NS, Drive, load_drive, place_odometry
 from sequences.filter_pass import FilterPass
 from sequences.metrics import position_errors
-from sequences.offline import smooth_drive
+from sequences.offline import calibrate_drive, smooth_drive
 from sequences.run_metrics import run_metrics
 from sequences.run_result import FrameRow, RunResult, Snapshot
 from sequences.sequence import Sequence
@@ -66,8 +66,7 @@ def track(
     """
     drive = load_drive(sequence, settings.odometry)
     prior = start_prior(drive, settings)
-    increments = increments_at(drive.stamps_ns, drive.odometry, settings.noise)
-    online = FilterPass(drive, increments, matcher, prior, settings)
+    online = FilterPass(drive, _increments(drive, settings), matcher, prior, settings)
     if progress is not None:
         progress.start(len(drive.indices))
     for frame in range(len(drive.indices)):
@@ -81,16 +80,11 @@ def track(
         "map",
     )
     begin = time.perf_counter()
-    smoothed, calibration = smooth_drive(
-        drive.stamps_ns,
-        sequence.odometry(settings.odometry),
-        settings.noise,
-        online.patches,
-        prior,
-        filtered,
-        SmootherSettings(outlier_probability=settings.outlier_probability),
-    )
+    seen = (drive.stamps_ns, sequence.odometry(settings.odometry), settings.noise, online.patches, prior, filtered)
+    smoother = SmootherSettings(outlier_probability=settings.outlier_probability)
+    smoothed, calibration = smooth_drive(*seen, smoother)
     smoothing_s = time.perf_counter() - begin
+    filter_calibration = calibrate_drive(*seen, replace(smoother, drift=OdometryDrift.steady()))
     measured = sorted(online.best)
     result = RunResult(
         sequence_name=sequence.name,
@@ -113,9 +107,19 @@ def track(
         odometry_source=settings.odometry,
         length_m=drive.length_m,
         odometry_calibration=calibration,
+        filter_calibration=filter_calibration,
         log=[*_described(drive), *online.log],
     )
     return replace(result, metrics=run_metrics(result, smoothing_s))
+
+
+def _increments(drive: Drive, settings: TrackSettings) -> list[OdometryIncrement]:
+    """What moves the filter: the odometry as it comes, or corrected by what an earlier drive has shown."""
+    known = settings.calibration
+    if known is None:
+        return increments_at(drive.stamps_ns, drive.odometry, settings.noise)
+    odometry = known.corrected(drive.sequence.odometry(settings.odometry))
+    return increments_at(drive.stamps_ns, odometry, known.noise(settings.noise), STAMP_TOLERANCE_NS)
 
 
 def _with_map_error(estimate: Trajectory, sigma_m: float) -> Trajectory:

@@ -18,6 +18,21 @@ from fusion.trajectory import Trajectory
 _TOLERANCE_NS = 1_000_000  # by which stamps may lie beyond the odometry's
 
 
+def calibrate_drive(
+    stamps_ns: IntArray,
+    odometry: Trajectory,
+    noise: OdometryNoise,
+    measurements: Sequence[Measurement | None],
+    prior: UniformPrior,
+    filtered: Trajectory,
+    settings: SmootherSettings,
+) -> OdometryCalibration:
+    """The odometry's errors by the frames that were measured; arguments as for `smooth_drive`."""
+    seen = [(stamp, one) for stamp, one in zip(stamps_ns.tolist(), measurements, strict=True) if one is not None]
+    measured_ns = np.array([stamp for stamp, _ in seen], dtype=np.int64)
+    return calibrate_odometry(measured_ns, odometry, noise, [one for _, one in seen], prior, filtered, settings)
+
+
 def smooth_drive(
     stamps_ns: IntArray,
     odometry: Trajectory,
@@ -50,16 +65,7 @@ def smooth_drive(
         If the odometry does not cover the stamps or the optimisation diverges.
     """
     settings = settings or SmootherSettings()
-    seen = [(stamp, one) for stamp, one in zip(stamps_ns.tolist(), measurements, strict=True) if one is not None]
-    calibration = calibrate_odometry(
-        np.array([stamp for stamp, _ in seen], dtype=np.int64),
-        odometry,
-        noise,
-        [one for _, one in seen],
-        prior,
-        filtered,
-        settings,
-    )
+    calibration = calibrate_drive(stamps_ns, odometry, noise, measurements, prior, filtered, settings)
     moved = calibration.corrected(odometry)
     increments = increments_at(stamps_ns, moved, calibration.noise(noise), tolerance_ns=_TOLERANCE_NS)
     drifting = replace(settings, drift=calibration.drift(OdometryDrift()))

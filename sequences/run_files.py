@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from fusion.errors import SkyfixError
+from fusion.odometry_calibration import OdometryCalibration
 
 METRICS_FILE = "metrics.json"
 CONFIG_FILE = "config.yaml"
@@ -42,3 +44,13 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise SkyfixError(f"{run_dir / METRICS_FILE}: cannot be read: {error}") from error
     return metrics
+
+
+def read_calibration(run_dir: Path) -> OdometryCalibration:
+    """The odometry's errors that a run has found, for a filter; `SkyfixError` when there are none to be read."""
+    found: Any = read_metrics(run_dir).get("filter_calibration")
+    try:
+        return OdometryCalibration(**{entry.name: float(found[entry.name]) for entry in fields(OdometryCalibration)})
+    except (KeyError, TypeError, ValueError, SkyfixError) as error:
+        where = run_dir / METRICS_FILE
+        raise SkyfixError(f"{where}: expected the numbers of a filter_calibration, got {found!r}") from error

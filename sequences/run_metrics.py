@@ -56,6 +56,7 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
         "measured_frames": sum(row.measured for row in rows),
         "skipped_frames": sum(bool(row.skipped_reason) for row in rows),
         "odometry_calibration": asdict(result.odometry_calibration),
+        "filter_calibration": asdict(result.filter_calibration),
         **methods,
         "seconds_per_frame": {stage: value / len(rows) for stage, value in seconds.items()},
         "realtime_factor": duration / processing,

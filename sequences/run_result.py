@@ -126,7 +126,9 @@ class RunResult:
     length_m
         Path length of the truth, or of the odometry where there is none.
     odometry_calibration
-        The odometry's constant errors, as the smoother found and removed them.
+        The odometry's errors, as the smoother found and removed them.
+    filter_calibration
+        The same for a filter, which cannot follow a scale that wanders and takes it as noise.
     log
         Lines of `log.txt`.
     """
@@ -149,4 +151,5 @@ class RunResult:
     odometry_source: str
     length_m: float
     odometry_calibration: OdometryCalibration
+    filter_calibration: OdometryCalibration
     log: list[str]

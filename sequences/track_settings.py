@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 
 from fusion.errors import SkyfixError
 from fusion.odometry import OdometryNoise
+from fusion.odometry_calibration import OdometryCalibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,9 @@ class TrackSettings:
         Measured frames kept for the report.
     noise
         The odometry's noise, standard deviations that grow with the root of the distance.
+    calibration
+        The odometry's errors, known from an earlier drive; the filter gets it corrected and its noise as it was found.
+        The smoother finds them by itself. None: the odometry as it comes.
     """
 
     odometry: str
@@ -101,6 +105,7 @@ class TrackSettings:
     winner_share: float = 0.9
     snapshots: int = 6
     noise: OdometryNoise = field(default_factory=OdometryNoise)
+    calibration: OdometryCalibration | None = None
 
     def __post_init__(self) -> None:
         for entry in fields(self):

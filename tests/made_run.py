@@ -75,6 +75,7 @@ def made_run(frames: int = 120, *, with_truth: bool = True, snapshots: int = 6, 
         metrics={
             **({**summaries, "drift": drift(truth, smoothed, odometry)} if with_truth else {}),
             "odometry_calibration": asdict(CALIBRATION),
+            "filter_calibration": asdict(CALIBRATION),
             "seconds_per_frame": {"predict": 4e-4, "scan": 7e-4, "match": 1e-2, "update": 3e-4, "smooth": 5e-4},
             "realtime_factor": 3.2,
         },
@@ -83,6 +84,7 @@ def made_run(frames: int = 120, *, with_truth: bool = True, snapshots: int = 6, 
         odometry_source="wheels_emulated",
         length_m=truth.length_m,
         odometry_calibration=CALIBRATION,
+        filter_calibration=CALIBRATION,
         log=["frame 9 (4.5 s): not measured: scan 8: expected points, got none", "<i>second line</i>"],
     )
 

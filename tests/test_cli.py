@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +23,7 @@ import sequences.localize
 import sequences.progress
 import sequences.train_command
 from fusion.errors import SkyfixError
+from fusion.odometry_calibration import OdometryCalibration
 from sequences.cli import app, main
 from sequences.cli_track import default_odometry
 from sequences.folder import FolderSequence
@@ -124,7 +127,11 @@ def test_metrics_have_what_other_programs_read(tracked: TrackedRun) -> None:
 
 
 def test_every_option_of_track_reaches_the_settings(
-    made_drive: MadeDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tracked: TrackedRun,
+    made_drive: MadeDrive,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen: list[TrackSettings] = []
 
@@ -145,6 +152,7 @@ def test_every_option_of_track_reaches_the_settings(
         "--map-error-m": "0.25",
         "--particles": "1234",
         "--watch-map-every": "6",
+        "--calibration": str(tracked.out),
     }
     words = [word for option, value in options.items() for word in (option, *value.split())]
     out = ("--out", str(tmp_path / "out"))
@@ -162,10 +170,33 @@ def test_every_option_of_track_reaches_the_settings(
             correlation_length_m=11.0,
             map_error_m=0.25,
             map_check_every_m=6.0,
+            calibration=OdometryCalibration(
+                **json.loads((tracked.out / "metrics.json").read_text())["filter_calibration"]
+            ),
         )
     ]
     assert skyfix(capsys, monkeypatch, "track", str(made_drive.path), *out, "--start-anywhere").code == 2
     assert seen[1:] == [TrackSettings(odometry="wheels", start_anywhere=True)]
+
+
+@pytest.mark.parametrize("change", [None, {"along_noise": "big"}, {"along_noise": 0.0}, {"log_scale": math.nan}])
+def test_a_run_without_a_calibration_is_named(
+    tracked: TrackedRun,
+    change: dict[str, object] | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = shutil.copytree(tracked.out, tmp_path / "run")
+    metrics = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(
+        json.dumps(metrics | {"filter_calibration": change and metrics["filter_calibration"] | change})
+    )
+    target = ("--out", str(tmp_path / "out"))
+    finished = skyfix(capsys, monkeypatch, "track", str(tracked.made.path), *target, "--calibration", str(run))
+    assert finished.code == 2
+    assert "filter_calibration" in finished.err
+    assert not (tmp_path / "out").exists()
 
 
 def test_view_prints_the_same_table_again(

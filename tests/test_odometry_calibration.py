@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from fusion import GaussianMixture, OdometryNoise, Trajectory, UniformPrior, se2, smooth
+from fusion import GaussianMixture, OdometryNoise, SmootherSettings, Trajectory, UniformPrior, se2, smooth
+from fusion.errors import SkyfixError
+from fusion.factor_graph import OdometryDrift
 from fusion.odometry import increments_at
 from fusion.odometry_calibration import OdometryCalibration, calibrate_odometry
 
@@ -100,3 +102,38 @@ def test_no_correction_is_none() -> None:
     odometry = drive(0.3)
     same = OdometryCalibration().corrected(odometry)
     np.testing.assert_allclose(same.interpolate(odometry.stamp_ns), odometry.poses, atol=1e-12)
+
+
+def test_for_a_filter_what_wanders_is_noise() -> None:
+    """A scale that wanders by some per cent: a state of the graph, or more noise along the way."""
+    truth, rng = drive(0.4), np.random.default_rng(4)
+    stamps = truth.stamp_ns[::10]
+    wander = 0.05 * np.sin(np.arange(len(truth) - 1) / 150.0)
+    moves = se2.between(truth.poses[:-1], truth.poses[1:]) * (1.0 + wander[:, None]) ** [1, 1, 0]
+    told = [truth.poses[0]]
+    for move in moves:
+        told.append(se2.compose(told[-1], move))
+    odometry = Trajectory(truth.stamp_ns, np.array(told), None, "odometry")
+    covariance = np.diag([0.1, 0.1, np.deg2rad(0.5)]) ** 2
+    poses = truth.interpolate(stamps)
+    off = rng.multivariate_normal(np.zeros(3), covariance, len(poses))
+    seen = [
+        GaussianMixture(np.ones(1), (pose + by)[None], covariance[None]) for pose, by in zip(poses, off, strict=True)
+    ]
+    initial = Trajectory(stamps, poses, np.repeat(covariance[None], len(stamps), axis=0))
+    noise, prior = OdometryNoise(longitudinal_m_per_sqrt_m=0.02), UniformPrior(poses[0], 5.0, 0.2)
+    loose = OdometryDrift(log_scale_walk=0.05, stretch_m=25.0)
+    noises = [
+        calibrate_odometry(stamps, odometry, noise, seen, prior, initial, SmootherSettings(drift=drift)).along_noise
+        for drift in (loose, OdometryDrift.steady())
+    ]
+    assert noises[1] > 1.5 * noises[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [("clock_offset_s", np.nan, "a finite"), ("log_scale", np.inf, "a finite"), ("heading_noise", 0.0, "a positive")],
+)
+def test_impossible_values_are_named(name: str, value: float, expected: str) -> None:
+    with pytest.raises(SkyfixError, match=f"odometry calibration {name}: expected {expected} number, got {value}"):
+        OdometryCalibration(**{name: value})

@@ -42,6 +42,19 @@ class OdometryDrift:
             if not (np.isfinite(value) and value > 0.0):
                 raise SkyfixError(f"odometry drift {entry.name}: expected > 0, got {value}")
 
+    @classmethod
+    def steady(cls) -> "OdometryDrift":
+        """Scale and mounting that stay, and no heading bias: all that a filter, which has no such states, can take out.
+
+        What does wander is then found as noise.
+        """
+        return cls(
+            log_scale_walk=1e-4,
+            mount_yaw_walk_rad=2e-5,
+            heading_bias_rad_per_m=1e-6,
+            heading_bias_walk_rad_per_m=1e-7,
+        )
+
     @property
     def first_sigmas(self) -> FloatArray:
         """(3,), of the first stretch."""
