@@ -23,6 +23,7 @@ from fusion.emulation.likelihood_emulator import EmulatorSettings, LikelihoodEmu
 from fusion.error_memory import ErrorMemory
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
+from fusion.factor_graph import OdometryDrift, SmootherSettings
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.odometry import OdometryNoise, increments_at
 from fusion.odometry_calibration import OdometryCalibration
@@ -32,7 +33,7 @@ from fusion.particles.cloud_history import CloudHistory
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 from sequences.metrics import summarise
-from sequences.offline import smooth_drive
+from sequences.offline import calibrate_drive, smooth_drive
 from sequences.start import offset_in_box
 
 _START_STREAM, _PRIOR_STREAM, _FILTER_STREAM, _MEASURE_STREAM, _SMOOTHER_STREAM = range(5)
@@ -59,9 +60,9 @@ class EmulatedRunSettings:
         emulator's own. One found by `estimate_error_correlation` is what a user would have: errors with tails repeat
         less than the Gaussians that they are drawn by.
     calibration
-        The odometry's constant errors, taken out beforehand.
+        The odometry's errors, taken out beforehand, and how much of the noise it really has.
     noise, smoother
-        The odometry's noise, and how paths are drawn.
+        The odometry's noise as it is assumed, and how paths are drawn.
     """
 
     profile: ErrorProfile = TRANSLOCNET_KITTI
@@ -111,6 +112,8 @@ class EmulatedRun:
         The measurements' own answers.
     measured
         (K,) frames with a measurement.
+    filter_calibration
+        The odometry's errors as this run shows them: the `calibration` of a second one.
     metrics
         `metrics.summarise` by method: prior, odometry, single_shot, filter, smoother, graph.
     """
@@ -121,6 +124,7 @@ class EmulatedRun:
     graph: Trajectory
     single_shot: Trajectory
     measured: IntArray
+    filter_calibration: OdometryCalibration
     metrics: dict[str, dict[str, Any]]
 
     def table(self) -> str:
@@ -161,8 +165,8 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
     stamps, poses, profile = truth.stamp_ns, truth.poses, settings.profile
     if len(truth) < 2:
         raise SkyfixError(f"truth: expected at least two poses, got {len(truth)}")
-    moved = settings.calibration.corrected(odometry)
-    increments = increments_at(stamps, moved, settings.noise, tolerance_ns=1_000_000)
+    moved, noise = settings.calibration.corrected(odometry), settings.calibration.noise(settings.noise)
+    increments = increments_at(stamps, moved, noise, tolerance_ns=1_000_000)
     box = (profile.half_extent_m, profile.half_heading_rad)
     start = poses[0] + offset_in_box(*box, np.random.default_rng([settings.seed, _START_STREAM]), 1)[0]
     streams = {n: np.random.default_rng([settings.seed, n]) for n in (_FILTER_STREAM, _MEASURE_STREAM)}
@@ -204,7 +208,9 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
     offsets = offset_in_box(*box, np.random.default_rng([settings.seed, _PRIOR_STREAM]), len(truth))
     placed = _placed(np.array([increment.delta for increment in increments]), start)
     smoother = smoothed.trajectory()
-    graph = smooth_drive(stamps, moved, settings.noise, mixtures, prior, filtered)[0].trajectory
+    seen = (stamps, moved, noise, mixtures, prior, filtered)
+    graph = smooth_drive(*seen)[0].trajectory
+    calibration = calibrate_drive(*seen, SmootherSettings(drift=OdometryDrift.steady()))
     metrics = {
         "prior": summarise(poses, poses + offsets),
         "odometry": summarise(poses, placed),
@@ -213,7 +219,7 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
         "smoother": summarise(poses, smoother.poses, smoother.covariances),
         "graph": summarise(poses, graph.poses, graph.covariances),
     }
-    return EmulatedRun(profile.name, filtered, smoother, graph, single_shot, measured, metrics)
+    return EmulatedRun(profile.name, filtered, smoother, graph, single_shot, measured, calibration, metrics)
 
 
 def _placed(deltas: FloatArray, start: FloatArray) -> FloatArray:

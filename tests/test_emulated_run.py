@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -85,10 +86,17 @@ def test_a_kilometre_of_real_odometry(shared_data: Callable[[str], Path]) -> Non
     assert sequence.ground_truth is not None
     truth = Trajectory(sequence.ground_truth.stamp_ns[:1200], sequence.ground_truth.poses[:1200])
     settings = EmulatedRunSettings(particles=1000, kept_particles=1000, smoother=QUICK)
-    metrics = run_emulated(truth, sequence.odometry("sptam"), settings).metrics
+    run = run_emulated(truth, sequence.odometry("sptam"), settings)
+    metrics = run.metrics
     assert metrics["single_shot"]["position_error_m"]["mean"] > 5.0
     assert metrics["filter"]["position_error_m"]["mean"] < 2.5
     assert metrics["smoother"]["position_error_m"]["mean"] < 1.4
     assert 0.4 < metrics["smoother"]["nees"]["mean"] / 3 < 1.6
     assert metrics["graph"]["position_error_m"]["mean"] < 1.0
     assert 0.4 < metrics["graph"]["nees"]["mean"] / 3 < 1.6
+    again = run_emulated(
+        truth, sequence.odometry("sptam"), replace(settings, calibration=run.filter_calibration)
+    ).metrics
+    assert again["filter"]["position_error_m"]["mean"] < 0.9 * metrics["filter"]["position_error_m"]["mean"]
+    assert again["filter"]["heading_error_deg"]["mean"] < 0.9 * metrics["filter"]["heading_error_deg"]["mean"]
+    assert 0.4 < again["filter"]["nees"]["mean"] / 3 < 1.6
