@@ -56,6 +56,8 @@ class SimulationSettings:
         Share of neighbourhoods whose map is what an aerial image shows, segmented, instead of OpenStreetMap's.
     drivable_share
         Share of those whose map shows carriageways alone, with their full width.
+    overgrown_share
+        Share of neighbourhoods whose unpaved ground is mostly hedges and brushwood, which hide the houses.
     """
 
     samples: int = 16000
@@ -68,6 +70,7 @@ class SimulationSettings:
     least_buildings: int = 5
     overhead_share: float = 0.0
     drivable_share: float = 0.0
+    overgrown_share: float = 0.0
     seed: int = 0
 
 
@@ -177,6 +180,8 @@ class SimulatedSamples:
             if sum(area.kind == "building" for area in here.areas) < settings.least_buildings and rng.random() < 0.9:
                 continue
             style = WorldStyle.random(rng)
+            if settings.overgrown_share > 0 and rng.random() < settings.overgrown_share:
+                style = replace(style, undergrowth=float(rng.uniform(0.4, 0.98)))
             world, map_raster = build_area(features, grid, style, rng)
             if settings.overhead_share > 0 and rng.random() < settings.overhead_share:
                 only_drivable = rng.random() < settings.drivable_share
