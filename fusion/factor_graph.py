@@ -121,7 +121,7 @@ def smooth(
             f"smoother: expected {len(stamps) - 1} increments and {len(stamps)} measurements, "
             f"got {len(increments)} and {len(measurements)}"
         )
-    if any(increment.stamp_ns != stamp for increment, stamp in zip(increments, stamps[1:], strict=True)):
+    if [increment.stamp_ns for increment in increments] != stamps[1:].tolist():
         raise SkyfixError("increments: expected one ending at every stamp after the first, got other stamps")
     starts = [initial] if isinstance(initial, Trajectory) else list(initial)
     if not starts:

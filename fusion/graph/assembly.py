@@ -9,6 +9,7 @@ from fusion.graph.calibration_walk import CalibrationWalk
 from fusion.graph.chain import Chain
 from fusion.graph.chain_graph import ChainGraph
 from fusion.graph.covariances import noises_of, positive_definite
+from fusion.graph.inverses import inverses
 from fusion.graph.odometry_drift import OdometryDrift
 from fusion.graph.odometry_factors import CalibratedOdometry
 from fusion.graph.plain_odometry import PlainOdometry
@@ -56,6 +57,6 @@ def pose_graph(
 
 
 def _walk(chain: Chain, drift: OdometryDrift, huber_width: float) -> CalibrationWalk:
-    roots = np.linalg.inv(np.linalg.cholesky(positive_definite(chain.covariances)))
+    roots = inverses(np.linalg.cholesky(positive_definite(chain.covariances)))
     odometry = CalibratedOdometry(chain.deltas, roots, drift.stretches(chain.deltas), huber_width)
     return CalibrationWalk(odometry, drift.first_sigmas, drift.step_sigmas)

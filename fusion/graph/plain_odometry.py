@@ -14,6 +14,7 @@ from fusion.arrays import FloatArray, IntArray
 from fusion.graph.chain_algebra import OPTIONS, invert
 from fusion.graph.chain_steps import motion_error
 from fusion.graph.covariances import positive_definite, turned
+from fusion.graph.inverses import inverses
 
 _NO_SIGMAS = np.zeros(0)
 
@@ -40,7 +41,7 @@ class PlainOdometry:
     def of(cls, deltas: FloatArray, covariances: FloatArray, huber_width: float) -> Self:
         """Motions whose coordinates have covariances (M, 3, 3), on the axes of the body where they begin."""
         own = positive_definite(turned(covariances, -deltas[:, 2]))
-        return cls(deltas, np.linalg.inv(np.linalg.cholesky(own)), huber_width)
+        return cls(deltas, inverses(np.linalg.cholesky(own)), huber_width)
 
     @property
     def count(self) -> int:

@@ -4,12 +4,16 @@ A window ``N(c, W)`` that is not much wider than the cells is summed on a lattic
 is the unit Gaussian (`fusion.graph.window_lattice`). A wide one is summed cell by cell.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from fusion.graph.spline import OPTIONS
 from fusion.graph.window_lattice import REACH, sum_lattice
+from fusion.kernels.float_math import intrinsic
 
 _WIDE_CELLS = 1.5  # standard deviations of a window along each axis from which cells are sampled well enough
 
@@ -72,15 +76,20 @@ def _sum_cells(
     return float(np.log(total) + log_uniform)
 
 
+@intrinsic
+def _cells_at(_context: Any, address: Any) -> Any:
+    """The float32 values that begin at an address."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return types.CPointer(types.float32)(types.int64), generate
+
+
 @numba.njit(**OPTIONS)
 def window_moments(
-    table: NDArray[np.float32],
-    begins: NDArray[np.int64],
-    shapes: NDArray[np.int64],
-    firsts: NDArray[np.float64],
-    cells: NDArray[np.float64],
-    floors: NDArray[np.float64],
-    log_uniforms: NDArray[np.float64],
+    tables: NDArray[np.int64],
+    places: NDArray[np.float64],
     outlier: float,
     centres: NDArray[np.float64],
     roots: NDArray[np.float64],
@@ -93,16 +102,12 @@ def window_moments(
 
     Parameters
     ----------
-    table : (cells,) float32
-        Log densities of all likelihoods; each begins at `begins` and has the cells of `shapes` (M, 3).
-    shapes : (M, 4) int64
-        Rows, columns, yaw bins, and whether these close to a circle.
-    firsts : (M, 3) float64
-        x, y and yaw of the centre of the first cell; rows go down.
-    cells : (M, 2) float64
-        Metres and radians of a cell.
-    floors, log_uniforms : (M,) float64
-        ln density beyond the cells, and of an outlier.
+    tables : (M, 5) int64
+        Of each likelihood's ln densities, float32: the address in memory, rows, columns, yaw bins, and whether these
+        close to a circle.
+    places : (M, 7) float64
+        x, y and yaw of the centre of the first cell, rows go down; metres and radians of a cell; ln density beyond the
+        cells, and of an outlier.
     outlier : float
         Its probability p.
     centres, roots : (M, 3), (M, 3, 3) float64
@@ -111,22 +116,20 @@ def window_moments(
         Written: ln of the windowed mass, mean (M, 3) and covariance (M, 3, 3) of u, and the variances (M, 3) that a
         flat likelihood would have had on the same lattice.
     """
-    for m in range(len(begins)):
-        rows, cols, bins = shapes[m, 0], shapes[m, 1], shapes[m, 2]
-        patch = table[begins[m] : begins[m] + rows * cols * bins].reshape(rows, cols, bins)
-        if _is_wide(roots[m], cells[m, 0], cells[m, 1]):
-            log_mass[m] = _sum_cells(
-                patch, firsts[m], cells[m], log_uniforms[m], outlier, centres[m], roots[m], means[m], spreads[m]
-            )
+    for m in range(len(tables)):
+        patch = numba.carray(_cells_at(tables[m, 0]), (tables[m, 1], tables[m, 2], tables[m, 3]))
+        first, cell, floor, log_uniform = places[m, :3], places[m, 3:5], places[m, 5], places[m, 6]
+        if _is_wide(roots[m], cell[0], cell[1]):
+            log_mass[m] = _sum_cells(patch, first, cell, log_uniform, outlier, centres[m], roots[m], means[m], spreads[m])
             flat[m] = 1.0
         else:
             log_mass[m] = sum_lattice(
                 patch,
-                shapes[m, 3] == 1,
-                firsts[m],
-                cells[m],
-                floors[m],
-                log_uniforms[m],
+                tables[m, 4] == 1,
+                first,
+                cell,
+                floor,
+                log_uniform,
                 outlier,
                 centres[m],
                 roots[m],
