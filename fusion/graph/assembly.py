@@ -10,7 +10,6 @@ from fusion.graph.chain import Chain
 from fusion.graph.chain_graph import ChainGraph
 from fusion.graph.covariances import noises_of, positive_definite
 from fusion.graph.inverses import inverses
-from fusion.graph.odometry_drift import OdometryDrift
 from fusion.graph.odometry_factors import CalibratedOdometry
 from fusion.graph.plain_odometry import PlainOdometry
 from fusion.graph.pose_graph import PoseGraph
@@ -25,29 +24,40 @@ def pose_graph(
     settings: SmootherSettings,
     others: Sequence[gtsam.NonlinearFactor] = (),
 ) -> SteppedGraph:
-    """Prior, odometry and `others`, on keys 0 to N - 1.
+    """Prior, odometry and `others`: without any, a chain that needs no GTSAM.
 
     Parameters
     ----------
     others : sequence of gtsam.NonlinearFactor
-        Absolute factors, loop closures.
+        Absolute factors, loop closures; on keys 0 to N - 1.
     """
-    count, drift = len(chain.deltas) + 1, settings.drift
-    width = np.inf if settings.odometry_kernel == "none" else settings.odometry_kernel_width
-    walk = None if drift is None or count == 1 else _walk(chain, drift, width)
-    if not others and settings.odometry_kernel != "dcs":
-        first = PlainOdometry.of(prior.mean[None], prior.covariance[None], np.inf)
-        return ChainGraph(first, walk or PlainOdometry.of(chain.deltas, chain.covariances, width), count)
+    if others or settings.odometry_kernel == "dcs":
+        return gtsam_graph(chain, prior, settings, others)
+    first = PlainOdometry.of(prior.mean[None], prior.covariance[None], np.inf)
+    walk = _walk(chain, settings)
+    motions = walk or PlainOdometry.of(chain.deltas, chain.covariances, _huber_width(settings))
+    return ChainGraph(first, motions, len(chain.deltas) + 1)
+
+
+def gtsam_graph(
+    chain: Chain,
+    prior: UniformPrior,
+    settings: SmootherSettings,
+    others: Sequence[gtsam.NonlinearFactor] = (),
+) -> PoseGraph:
+    """As `pose_graph`, of GTSAM's factors."""
+    count = len(chain.deltas) + 1
     graph = gtsam.NonlinearFactorGraph()
-    [first_noise] = noises_of(prior.covariance[None], prior.mean[None, 2])
-    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*prior.mean), first_noise))
+    [first] = noises_of(prior.covariance[None], prior.mean[None, 2])
+    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*prior.mean), first))
     for factor in others:
         graph.push_back(factor)
     is_chain = all(np.ptp(list(factor.keys())) <= 1 for factor in others)
+    walk = _walk(chain, settings)
     if walk is not None:
         return PoseGraph(graph, count, is_chain, walk)
     noises: list[gtsam.noiseModel.Base] = [*noises_of(chain.covariances, chain.deltas[:, 2])]
-    kernels = gtsam.noiseModel.mEstimator
+    width, kernels = settings.odometry_kernel_width, gtsam.noiseModel.mEstimator
     if settings.odometry_kernel != "none":
         kernel = kernels.Huber.Create(width) if settings.odometry_kernel == "huber" else kernels.DCS.Create(width)
         noises = [gtsam.noiseModel.Robust.Create(kernel, noise) for noise in noises]
@@ -56,7 +66,15 @@ def pose_graph(
     return PoseGraph(graph, count, is_chain)
 
 
-def _walk(chain: Chain, drift: OdometryDrift, huber_width: float) -> CalibrationWalk:
-    roots = inverses(np.linalg.cholesky(positive_definite(chain.covariances)))
-    odometry = CalibratedOdometry(chain.deltas, roots, drift.stretches(chain.deltas), huber_width)
+def _walk(chain: Chain, settings: SmootherSettings) -> CalibrationWalk | None:
+    """The odometry with its calibrations, when there are any."""
+    drift = settings.drift
+    if drift is None or len(chain.deltas) == 0:
+        return None
+    own = np.asarray(np.linalg.cholesky(positive_definite(chain.covariances)), dtype=np.float64)
+    odometry = CalibratedOdometry(chain.deltas, inverses(own), drift.stretches(chain.deltas), _huber_width(settings))
     return CalibrationWalk(odometry, drift.first_sigmas, drift.step_sigmas)
+
+
+def _huber_width(settings: SmootherSettings) -> float:
+    return np.inf if settings.odometry_kernel == "none" else settings.odometry_kernel_width

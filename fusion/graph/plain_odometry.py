@@ -41,7 +41,7 @@ class PlainOdometry:
     def of(cls, deltas: FloatArray, covariances: FloatArray, huber_width: float) -> Self:
         """Motions whose coordinates have covariances (M, 3, 3), on the axes of the body where they begin."""
         own = positive_definite(turned(covariances, -deltas[:, 2]))
-        return cls(deltas, inverses(np.linalg.cholesky(own)), huber_width)
+        return cls(deltas, inverses(np.asarray(np.linalg.cholesky(own), dtype=np.float64)), huber_width)
 
     @property
     def count(self) -> int:

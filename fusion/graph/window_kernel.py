@@ -120,7 +120,9 @@ def window_moments(
         patch = numba.carray(_cells_at(tables[m, 0]), (tables[m, 1], tables[m, 2], tables[m, 3]))
         first, cell, floor, log_uniform = places[m, :3], places[m, 3:5], places[m, 5], places[m, 6]
         if _is_wide(roots[m], cell[0], cell[1]):
-            log_mass[m] = _sum_cells(patch, first, cell, log_uniform, outlier, centres[m], roots[m], means[m], spreads[m])
+            log_mass[m] = _sum_cells(
+                patch, first, cell, log_uniform, outlier, centres[m], roots[m], means[m], spreads[m]
+            )
             flat[m] = 1.0
         else:
             log_mass[m] = sum_lattice(
