@@ -21,10 +21,10 @@ from fusion.graph.covariances import positive_definite
 from fusion.graph.measurements import NOT_MEASURED, REJECTED, Measurement, Measurements
 from fusion.graph.odometry_drift import OdometryDrift
 from fusion.graph.other_factors import AbsoluteFix, LoopClosure, OtherFactor, bound_nodes, native_factors
-from fusion.graph.pose_graph import PoseGraph, Solution
 from fusion.graph.propagation import Propagated, propagate
 from fusion.graph.sites import Sites
 from fusion.graph.smoother_settings import SmootherSettings
+from fusion.graph.solution import Solution, SteppedGraph
 from fusion.odometry import OdometryIncrement
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory, checked_stamps
@@ -121,7 +121,7 @@ def smooth(
             f"smoother: expected {len(stamps) - 1} increments and {len(stamps)} measurements, "
             f"got {len(increments)} and {len(measurements)}"
         )
-    if any(increment.stamp_ns != stamp for increment, stamp in zip(increments, stamps[1:], strict=True)):
+    if [increment.stamp_ns for increment in increments] != stamps[1:].tolist():
         raise SkyfixError("increments: expected one ending at every stamp after the first, got other stamps")
     starts = [initial] if isinstance(initial, Trajectory) else list(initial)
     if not starts:
@@ -158,7 +158,7 @@ def smooth(
 
 
 def _from(
-    start: Trajectory, stamps: IntArray, graphs: Sequence[PoseGraph], measurements: Measurements, max_rounds: int
+    start: Trajectory, stamps: IntArray, graphs: Sequence[SteppedGraph], measurements: Measurements, max_rounds: int
 ) -> Propagated:
     """From one graph's solution to the next, the last one to convergence."""
     poses, covariances = start.interpolate(stamps), _covariances_near(stamps, start)
@@ -169,7 +169,7 @@ def _from(
     return propagate(graphs[-1], measurements, poses, covariances, max_rounds)
 
 
-def _solved(graph: PoseGraph, solution: Solution, nodes: IntArray, sites: Sites) -> Solution:
+def _solved(graph: SteppedGraph, solution: Solution, nodes: IntArray, sites: Sites) -> Solution:
     """Steps to the end with the sites as they are."""
     for _ in range(_MOST_LAST_STEPS):
         before = solution.poses

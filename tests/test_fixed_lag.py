@@ -22,7 +22,7 @@ from fusion import (
     se2,
     smooth,
 )
-from fusion.graph.assembly import pose_graph
+from fusion.graph.assembly import gtsam_graph
 from fusion.graph.chain import Chain
 from fusion.graph.chain_solver import solve_chain
 from fusion.graph.lag_window import LagWindow
@@ -61,7 +61,7 @@ def test_the_chain_is_solved_as_gtsam_solves_it():
     nodes = np.arange(0, count, 3)
     reference = truth[nodes] + rng.multivariate_normal(np.zeros(3), SEEN, len(nodes))
     sites = Sites(reference, np.repeat(np.linalg.inv(SEEN)[None], len(nodes), 0), rng.normal(size=(len(nodes), 3)))
-    graph = pose_graph(chain, prior, SmootherSettings())
+    graph = gtsam_graph(chain, prior, SmootherSettings())
     solution = graph.at(rough(stamps, truth).poses.copy(), nodes, sites)
     for _ in range(15):
         solution = graph.step(solution, nodes, sites)

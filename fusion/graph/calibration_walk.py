@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from fusion import se2
 from fusion.arrays import FloatArray, IntArray
 from fusion.graph.odometry_factors import CalibratedOdometry
 
@@ -35,6 +36,11 @@ class CalibrationWalk:
         return int(self.odometry.stretch[-1]) + 1
 
     @property
+    def stretch(self) -> IntArray:
+        """The calibration of each motion (N - 1,), non-decreasing."""
+        return self.odometry.stretch
+
+    @property
     def _poses(self) -> int:
         return len(self.odometry.deltas) + 1
 
@@ -49,6 +55,12 @@ class CalibrationWalk:
         first = calibrations[0] / self.first_sigmas
         steps = np.diff(calibrations, axis=0) / self.step_sigmas
         return self.odometry.cost(poses, calibrations) + 0.5 * float((first**2).sum() + (steps**2).sum())
+
+    def linearised(self, poses: FloatArray, calibrations: FloatArray) -> tuple[FloatArray, ...]:
+        """As `CalibratedOdometry.linearised`, poses on the axes of the map."""
+        first, second, own, right = self.odometry.linearised(poses, calibrations)
+        back = se2.rotation(-poses[:, 2])
+        return first @ back[:-1], second @ back[1:], own, right
 
     def add_to(self, linear: gtsam.GaussianFactorGraph, poses: FloatArray, calibrations: FloatArray) -> None:
         """Add all factors, linearised; poses in GTSAM's body-frame tangent vectors."""

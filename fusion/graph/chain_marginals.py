@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.arrays import FloatArray, IntArray
-
-_WIDTH = 6
+from fusion.graph.chain_elimination import WIDTH
 
 
 def chain_covariances(bayes_net: gtsam.GaussianBayesNet, slots: IntArray) -> FloatArray:
@@ -31,24 +30,25 @@ def chain_covariances(bayes_net: gtsam.GaussianBayesNet, slots: IntArray) -> Flo
         any, the nearest calibration.
     """
     roots = np.empty((len(slots), 3, 3))
-    links = np.zeros((len(slots), 3, _WIDTH))
+    links = np.zeros((len(slots), 3, WIDTH))
     for k in range(len(slots)):
         conditional = bayes_net.at(k)
         roots[k] = conditional.R()
         link = conditional.S()
         links[k, :, : link.shape[1]] = link
     covariances = np.empty_like(roots)
-    _backward(roots, links, slots, covariances)
+    covariances_back(roots, links, slots, covariances)
     return covariances
 
 
 @numba.njit(cache=True, nogil=True)
-def _backward(
+def covariances_back(
     roots: NDArray[np.float64], links: NDArray[np.float64], slots: NDArray[np.int64], covariances: NDArray[np.float64]
 ) -> None:
-    joint = np.zeros((_WIDTH, _WIDTH))  # of the nearest pose and calibration after
-    inverse, gain = np.zeros((3, 3)), np.empty((3, _WIDTH))
-    cross = np.empty((3, _WIDTH))
+    """Write the covariances (V, 3, 3) of variables with the roots R (V, 3, 3) and the links S (V, 3, 6)."""
+    joint = np.zeros((WIDTH, WIDTH))  # of the nearest pose and calibration after
+    inverse, gain = np.zeros((3, 3)), np.empty((3, WIDTH))
+    cross = np.empty((3, WIDTH))
     for k in range(len(roots) - 1, -1, -1):
         root = roots[k]
         for j in range(3):
@@ -58,15 +58,15 @@ def _backward(
                     total -= root[i, m] * inverse[m, j]
                 inverse[i, j] = total / root[i, i]
         for i in range(3):
-            for j in range(_WIDTH):
+            for j in range(WIDTH):
                 total = 0.0
                 for m in range(i, 3):
                     total -= inverse[i, m] * links[k, m, j]
                 gain[i, j] = total
         for i in range(3):
-            for j in range(_WIDTH):
+            for j in range(WIDTH):
                 total = 0.0
-                for m in range(_WIDTH):
+                for m in range(WIDTH):
                     total += gain[i, m] * joint[m, j]
                 cross[i, j] = total
         for i in range(3):
@@ -74,12 +74,12 @@ def _backward(
                 total = 0.0
                 for m in range(3):
                     total += inverse[i, m] * inverse[j, m]
-                for m in range(_WIDTH):
+                for m in range(WIDTH):
                     total += cross[i, m] * gain[j, m]
                 covariances[k, i, j] = total
         begin = 3 * slots[k]
         for i in range(3):
-            for j in range(_WIDTH):
+            for j in range(WIDTH):
                 joint[begin + i, j] = cross[i, j]
                 joint[j, begin + i] = cross[i, j]
         for i in range(3):

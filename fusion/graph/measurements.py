@@ -44,6 +44,8 @@ class Measurements:
                 measurement = measurement.modes(1)
             if isinstance(measurement, GaussianMixture):
                 mixtures[node] = measurement
+            elif isinstance(measurement, LikelihoodPatch):
+                patches[node] = measurement
             elif measurement is not None:
                 patches[node] = patch_of(measurement)
         self.nodes: IntArray = np.array([*mixtures, *patches], dtype=np.int64)

@@ -54,7 +54,7 @@ class CalibratedOdometry:
         width = np.minimum(self.huber_width, length)
         return float((width * (length - 0.5 * width)).sum())
 
-    def linearised(self, poses: FloatArray, calibrations: FloatArray) -> list[tuple[FloatArray, ...]]:
+    def linearised(self, poses: FloatArray, calibrations: FloatArray) -> tuple[FloatArray, ...]:
         """By pose k, pose k + 1 and calibration, and the right-hand side, of each factor; whitened."""
         moved, expected, white = self._residuals(poses, calibrations)
         length = np.linalg.norm(white, axis=1)
@@ -64,7 +64,7 @@ class CalibratedOdometry:
         first[:, 0, 2], first[:, 1, 2] = moved[:, 1], -moved[:, 0]
         second = se2.rotation(moved[:, 2])
         by_calibration = -calibration_derivative(self.deltas, expected)
-        return [root @ first, root @ second, root @ by_calibration, -weight[:, None] * white]
+        return root @ first, root @ second, root @ by_calibration, -weight[:, None] * white
 
 
 def calibrated(deltas: FloatArray, calibrations: FloatArray) -> FloatArray:

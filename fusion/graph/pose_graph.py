@@ -4,8 +4,6 @@ GTSAM linearises its own factors and solves; the measurements come as quadratics
 odometry that is to be calibrated as Jacobian factors, so that no callback from GTSAM into Python is ever made.
 """
 
-from dataclasses import dataclass
-
 import gtsam
 import numpy as np
 
@@ -16,40 +14,7 @@ from fusion.graph.calibration_walk import CalibrationWalk
 from fusion.graph.chain_marginals import chain_covariances
 from fusion.graph.covariances import positive_definite, turned
 from fusion.graph.sites import Sites
-
-_HALVINGS = 12
-_SLACK = 1e-9  # of a cost, by which rounding may make a step look worse
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solution:
-    """Where a graph stands.
-
-    Parameters
-    ----------
-    values : gtsam.Values
-        Poses by node.
-    poses : (N, 3) float64
-        The same.
-    calibrations : (S, 3) float64
-        See `fusion.graph.odometry_factors`; S is 0 where the odometry is taken as it is.
-    covariances : (N, 3, 3) float64
-        Marginals on the axes of the map, linearised one step before `poses`; None when they were not asked for.
-    calibration_covariances : (S, 3, 3) float64
-        Of the calibrations, likewise.
-    cost : float
-        Minus the log posterior density, up to a constant.
-    half_log_det : float
-        Half ln of the determinant of the information.
-    """
-
-    values: gtsam.Values
-    poses: FloatArray
-    calibrations: FloatArray
-    covariances: FloatArray | None
-    calibration_covariances: FloatArray | None
-    cost: float
-    half_log_det: float
+from fusion.graph.solution import HALVINGS, Solution, is_no_worse
 
 
 class PoseGraph:
@@ -78,12 +43,9 @@ class PoseGraph:
 
     def at(self, poses: FloatArray, nodes: IntArray, sites: Sites) -> Solution:
         """The graph at poses (N, 3), before any step."""
-        values = gtsam.Values()
-        for node, (x, y, yaw) in enumerate(poses.tolist()):
-            values.insert(node, gtsam.Pose2(x, y, yaw))
         calibrations = np.zeros((0 if self._walk is None else self._walk.count, 3))
-        cost = self._cost(values, poses, calibrations, nodes, sites)
-        return Solution(values, poses, calibrations, None, None, cost, 0.0)
+        cost = self._cost(_values(poses), poses, calibrations, nodes, sites)
+        return Solution(poses, calibrations, None, None, cost, 0.0)
 
     def step(self, before: Solution, nodes: IntArray, sites: Sites, marginals: bool = True) -> Solution:
         """A Gauss-Newton step, halved until the cost does not grow.
@@ -93,7 +55,8 @@ class PoseGraph:
         SkyfixError
             When the graph cannot be solved or the solution is not finite.
         """
-        linear = self._linearised(before, nodes, sites)
+        given = _values(before.poses)
+        linear = self._linearised(given, before, nodes, sites)
         try:
             bayes_net = self._eliminated(linear)
             delta = bayes_net.optimize()
@@ -103,26 +66,28 @@ class PoseGraph:
             raise SkyfixError(f"smoother: expected a solvable graph, got {reason}") from error
         keys = range(self._count, self._count + len(before.calibrations))
         turns = np.array([delta.at(key) for key in keys]).reshape(-1, 3)
-        cost = self._cost(before.values, before.poses, before.calibrations, nodes, sites)
-        values, poses, calibrations, reached = before.values, before.poses, before.calibrations, np.inf
-        for halving in range(_HALVINGS):
-            values = before.values.retract(delta.scale(0.5**halving))
+        cost = self._cost(given, before.poses, before.calibrations, nodes, sites)
+        poses, calibrations, reached = before.poses, before.calibrations, np.inf
+        for halving in range(HALVINGS):
+            values = given.retract(delta.scale(0.5**halving))
             poses = np.array(gtsam.utilities.extractPose2(values)).reshape(-1, 3)
             calibrations = before.calibrations + 0.5**halving * turns
             reached = self._cost(values, poses, calibrations, nodes, sites)
-            if reached <= cost + _SLACK * (1.0 + abs(cost)):
+            if is_no_worse(reached, cost):
                 break
         finite = np.isfinite(reached) and np.isfinite(poses).all()
         if not finite or (covariances is not None and not np.isfinite(covariances).all()):
             raise SkyfixError("smoother: expected a finite solution, got NaN or an infinity")
         half_log_det = float(bayes_net.logDeterminant())
         if covariances is None:
-            return Solution(values, poses, calibrations, None, None, reached, half_log_det)
+            return Solution(poses, calibrations, None, None, reached, half_log_det)
         own = positive_definite(turned(covariances[: self._count], before.poses[:, 2]))
-        return Solution(values, poses, calibrations, own, covariances[self._count :], reached, half_log_det)
+        return Solution(poses, calibrations, own, covariances[self._count :], reached, half_log_det)
 
-    def _linearised(self, at: Solution, nodes: IntArray, sites: Sites) -> gtsam.GaussianFactorGraph:
-        linear = self._graph.linearize(at.values)
+    def _linearised(
+        self, values: gtsam.Values, at: Solution, nodes: IntArray, sites: Sites
+    ) -> gtsam.GaussianFactorGraph:
+        linear = self._graph.linearize(values)
         own = sites.about(at.poses[nodes])
         turn = se2.rotation(at.poses[nodes, 2])
         back = turn.swapaxes(1, 2)
@@ -156,3 +121,10 @@ class PoseGraph:
         found = np.empty((size, 3, 3))
         found[self._keys] = chain_covariances(bayes_net, self._slots)
         return found
+
+
+def _values(poses: FloatArray) -> gtsam.Values:
+    values = gtsam.Values()
+    for node, (x, y, yaw) in enumerate(poses.tolist()):
+        values.insert(node, gtsam.Pose2(x, y, yaw))
+    return values

@@ -14,8 +14,8 @@ import numpy as np
 
 from fusion.arrays import FloatArray, IntArray
 from fusion.graph.measurements import Measurements
-from fusion.graph.pose_graph import PoseGraph, Solution
 from fusion.graph.sites import Sites, no_sites
+from fusion.graph.solution import Solution, SteppedGraph
 
 _DAMPING = 0.85
 _POSITION_TOLERANCE_M = 2e-3
@@ -51,7 +51,7 @@ class Propagated:
 
 
 def propagate(
-    graph: PoseGraph,
+    graph: SteppedGraph,
     measurements: Measurements,
     poses: FloatArray,
     covariances: FloatArray,

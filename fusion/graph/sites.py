@@ -10,6 +10,7 @@ import numpy as np
 from fusion import se2
 from fusion.arrays import FloatArray
 from fusion.graph.covariances import raised
+from fusion.graph.inverses import inverses
 
 _LEAST_SHARE = 1e-3  # of a marginal's information that stays when its own factor is taken out
 
@@ -55,7 +56,7 @@ class Sites:
         roots = np.linalg.cholesky(covariances)
         across = roots.swapaxes(1, 2)
         whitened = np.eye(3) - across @ own.precision @ roots
-        cavity = roots @ np.linalg.inv(raised(whitened, _LEAST_SHARE)) @ across
+        cavity = roots @ inverses(raised(whitened, _LEAST_SHARE)) @ across
         centres = poses - np.einsum("mij,mj->mi", cavity, own.information)
         centres[:, 2] = se2.wrap(centres[:, 2])
         return centres, 0.5 * (cavity + cavity.swapaxes(1, 2))

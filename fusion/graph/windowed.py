@@ -7,6 +7,7 @@ import numpy as np
 from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from fusion.graph.covariances import raised
+from fusion.graph.inverses import inverses
 
 _LEAST_VARIANCE = 1e-12
 
@@ -43,10 +44,10 @@ class Windowed:
         measurement. Where the measurement is wider than any Gaussian (two modes in the window), the precision is 0
         along that direction: it is positive semidefinite by construction.
         """
-        within = np.linalg.inv(raised(self.spreads, _LEAST_VARIANCE))
+        within = inverses(raised(self.spreads, _LEAST_VARIANCE))
         precision = raised(within - _diagonal(1.0 / self.flat), 0.0)
         information = np.einsum("mij,mj->mi", precision, self.means) + self.means / self.flat
-        inverse = np.linalg.inv(self.roots)
+        inverse = inverses(self.roots)
         across = inverse.swapaxes(1, 2)
         return across @ precision @ inverse, np.einsum("mij,mj->mi", across, information)
 
