@@ -10,27 +10,20 @@ from fusion.kernels.random import U, normal_pair, threefry
 
 
 @numba.njit(**KERNEL)
-def three_normals(start: int, n: int, step: np.uint32, key: NDArray[np.uint32], s: Float32s) -> None:
-    """Normals for n particles from `start` on, into E0, E1 and E2 of the scratch `s`."""
-    words = (key[0], key[1], key[2], key[3])
-    for j in range(n):
-        a, b, _, d = threefry((U(start + j), step, U(0), U(0)), words)
-        first, second = normal_pair(a, d)
-        third, _ = normal_pair(b, U(d >> U(10)))
-        s[E0 + j], s[E1 + j], s[E2 + j] = first, second, third
+def three_normals(
+    start: int, n: int, step: np.uint32, stream: np.uint32, key: NDArray[np.uint32], row: int, s: Float32s
+) -> None:
+    """Normals for n particles from `start` on, into three rows of the scratch `s` from `row` on: E0 or E3.
 
-
-@numba.njit(**KERNEL)
-def six_normals(start: int, n: int, step: np.uint32, key: NDArray[np.uint32], s: Float32s) -> None:
-    """Normals for n particles from `start` on, into E0 to E5 of the scratch `s`; the first three are those above."""
+    A counter gives six normals, which is enough for two particles: one of each half of the block.
+    """
     words = (key[0], key[1], key[2], key[3])
-    for j in range(n):
-        a, b, c, d = threefry((U(start + j), step, U(0), U(0)), words)
-        first, second = normal_pair(a, d)
-        third, fourth = normal_pair(b, U(d >> U(10)))
-        fifth, sixth = normal_pair(c, U(d >> U(20)))
-        s[E0 + j], s[E1 + j], s[E2 + j] = first, second, third
-        s[E3 + j], s[E4 + j], s[E5 + j] = fourth, fifth, sixth
+    first, other = start // 2, row + BLOCK // 2
+    for j in range(min(n, BLOCK // 2)):
+        a, b, c, d = threefry((U(first + j), step, stream, U(0)), words)
+        s[row + j], s[row + BLOCK + j] = normal_pair(a, d)
+        s[row + 2 * BLOCK + j], s[other + j] = normal_pair(b, U(d >> U(10)))
+        s[other + BLOCK + j], s[other + 2 * BLOCK + j] = normal_pair(c, U(d >> U(20)))
 
 
 @numba.njit(**KERNEL)

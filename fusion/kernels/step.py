@@ -20,8 +20,12 @@ from fusion.kernels.layout import (
     ADDED,
     BLOCK,
     CLUSTER_KERNELS,
+    E0,
+    E3,
+    KERNEL_STREAM,
     KIND,
     MAPS,
+    MOTION_STREAM,
     NO_KERNEL,
     SCRATCH_SIZE,
     VOLUME,
@@ -30,7 +34,7 @@ from fusion.kernels.layout import (
     Int32s,
 )
 from fusion.kernels.moments import block_moments
-from fusion.kernels.motion import advance, fetch, regularise, regularise_in_clusters, six_normals, three_normals
+from fusion.kernels.motion import advance, fetch, regularise, regularise_in_clusters, three_normals
 from fusion.kernels.weigh import weigh_by_maps, weigh_by_volume
 
 
@@ -53,6 +57,7 @@ def step_blocks(
     look: Float64s,
     log_weights: Float64s,
     out: Float64s,
+    weights: Float32s,
     sums: Float64s,
 ) -> None:
     """Blocks `first` to `last` of one step.
@@ -80,6 +85,8 @@ def step_blocks(
         (N,) before the step; empty for equal ones, which then count as 0.
     out
         (N,) log weights after the step, not normalised.
+    weights
+        (N,) over the largest of their block.
     sums
         (blocks, SUMS), the moments of each block.
     """
@@ -92,10 +99,9 @@ def step_blocks(
         n = min(BLOCK, count - start)
         if motion.size > 0:
             fetch(source, ancestors, start, n, s)
-            if motion[KIND] == NO_KERNEL:
-                three_normals(start, n, word, key, s)
-            else:
-                six_normals(start, n, word, key, s)
+            three_normals(start, n, word, MOTION_STREAM, key, E0, s)
+            if motion[KIND] != NO_KERNEL:
+                three_normals(start, n, word, KERNEL_STREAM, key, E3, s)
                 if motion[KIND] == CLUSTER_KERNELS:
                     regularise_in_clusters(start, n, labels, clusters, s)
                 else:
@@ -113,4 +119,4 @@ def step_blocks(
         else:
             for j in range(n):
                 s[ADDED + j] = F(0)
-        block_moments(start, n, log_weights, out, look, s, sums[block])
+        block_moments(start, n, log_weights, out, look, s, weights, sums[block])

@@ -68,7 +68,7 @@ class Cloud:
         self._ancestors = _NOBODY
         self._labels, self._clusters = _NOBODY, NO_TABLE
         self._motion: list[float] | None = None
-        self._sums = np.zeros((0, at.SUMS))
+        self._weights, self._sums = np.zeros(0, np.float32), np.zeros((0, at.SUMS))
         self._reference = (0.0, 0.0, float(poses[0, 2]))
         self._moments: Moments | None = self._pass(None, 0.0)
         self._reference = self._moments.mean
@@ -156,10 +156,8 @@ class Cloud:
     def resample(self, count: int, offset: float) -> None:
         """Order systematic resampling to `count` equally weighted particles."""
         self._settle()
-        if len(self._log_weights) == 0:
-            self._log_weights = np.zeros(self._count)
         ancestors = self._buffer("ancestors", count, np.int32)
-        find_ancestors(self._threads, self._log_weights, self._sums, offset, ancestors)
+        find_ancestors(self._threads, self._weights, self._sums, offset, ancestors)
         self.keep(ancestors)
 
     def keep(self, ancestors: NDArray[np.int32]) -> None:
@@ -257,13 +255,16 @@ class Cloud:
         blocks = -(-self._count // at.BLOCK)
         if len(self._sums) != blocks:
             self._sums = np.zeros((blocks, at.SUMS))
+        if len(self._weights) != self._count:
+            self._weights = np.empty(self._count, np.float32)
         ordered = (source, self._ancestors, self._labels, self._clusters, motion, self._key, self._epoch, cloud)
         weigh = (
             (at.NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS)
             if lookup is None
             else (lookup.mode, lookup.table, lookup.location, lookup.slots)
         )
-        share(self._threads, step_blocks, blocks, *ordered, *weigh, look, self._log_weights, out, self._sums)
+        summed = (look, self._log_weights, out, self._weights, self._sums)
+        share(self._threads, step_blocks, blocks, *ordered, *weigh, *summed)
         return combined(self._sums, look)
 
     def _summary(self, sums: tuple[float, ...], weigh: list[float], look: FloatArray) -> Moments:
@@ -279,7 +280,7 @@ class Cloud:
                 self._spare["log weights"] = out
         if sums[12] + abs(sums[5]) >= _WHOLE_CIRCLE:
             low, high = (-4.0, sums[5] - pi) if sums[5] > 0.0 else (sums[5] + pi, 4.0)
-            share(self._threads, arc_blocks, len(self._sums), self._xyt, self._log_weights, look, low, high, self._sums)
+            share(self._threads, arc_blocks, len(self._sums), self._xyt, self._weights, look, low, high, self._sums)
             sums = combined(self._sums, look)
         largest, self._log_total, size, x, y, turned, xx, xy, yy, xt, yt, tt, _ = sums
         self._shift = largest if len(self._log_weights) else 0.0
