@@ -11,7 +11,7 @@ Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]
 Int32s = NDArray[np.int32]
 
-BLOCK = 1024
+BLOCK = 512
 SCRATCH_SIZE = 10 * BLOCK
 """float32 numbers that one thread needs beside its particles."""
 

@@ -16,6 +16,7 @@ from fusion.kernels import layout as at
 from fusion.kernels.cloud_clusters import gather_copies
 from fusion.kernels.moments import arc_blocks, combined
 from fusion.kernels.step import step_blocks
+from fusion.particles.arrangement import arrange, is_spread_out
 from fusion.particles.lookup import NO_SLOTS, NO_TABLE, Lookup
 from fusion.particles.moments import Moments, lower_root, wrapped
 from fusion.particles.regularisation import cluster_kernels, silverman_bandwidth
@@ -168,6 +169,16 @@ class Cloud:
         self._ancestors, self._count = ancestors, len(ancestors)
         self._log_weights, self._shift, self._log_total = _EQUAL, 0.0, log(len(ancestors))
         self._epoch += 1
+
+    def arrange(self) -> None:
+        """Put the copies just ordered in the order of their places, if that is worth it: it means nothing else."""
+        if is_spread_out(self._count, self.moments()):
+            copies, tiles, ordered = (
+                self._ancestors,
+                *(self._buffer(name, self._count, np.int32) for name in ("tiles", "ordered")),
+            )
+            arrange(self._threads, self._xyt, copies, self.moments(), tiles, ordered)
+            self._ancestors, self._spare["tiles"], self._spare["ordered"] = ordered, tiles, copies
 
     def regularise(self, width: float) -> None:
         """Order kernel noise of `width` standard deviations, with shrinkage, on top of resampling."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusion.arrays import Float32Array, FloatArray
 from fusion.kernels.resample import share_out, spread_blocks
 
-_LEAST_BLOCKS = 4  # a thread
+_LEAST_BLOCKS = 8  # a thread
 
 
 @cache
