@@ -33,6 +33,17 @@ _LOG2_E, _LN_2 = F(1.44269504), F(0.69314718)
 
 
 @intrinsic
+def widest(_context: Any) -> Any:
+    """Have the loops of the calling function use the widest registers there are: LLVM keeps to half of AVX-512's."""
+
+    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')  # llvmlite's own `add` knows no widths
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@intrinsic
 def bits_of(_context: Any, value: Any) -> Any:
     """The int32 with the bits of a float32."""
 

@@ -12,7 +12,7 @@ Source: streaming log-sum-exp with one maximum a block; circular means after Mar
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import KERNEL, F, exp, larger, sine_cosine, wrap
+from fusion.kernels.float_math import KERNEL, F, exp, larger, sine_cosine, widest, wrap
 from fusion.kernels.layout import (
     ADDED,
     ARC,
@@ -60,6 +60,7 @@ def block_moments(
     sums: Float64s,
 ) -> None:
     """New weights of a block, also as logarithms, and the sums of its moments about the reference pose."""
+    widest()
     if log_weights.size > 0:
         shift = look[LOG_SHIFT]
         for j in range(n):
@@ -129,6 +130,7 @@ def arc_blocks(
     sums
         (blocks, SUMS) of that pass, to which these are added.
     """
+    widest()
     count = cloud.size // 3
     rx, ry, rt = F(look[REFERENCE_X]), F(look[REFERENCE_Y]), F(look[REFERENCE_YAW])
     least, most = F(low), F(high)

@@ -4,7 +4,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels.float_math import KERNEL, F, get, put, sine_cosine, take, wrap
+from fusion.kernels.float_math import KERNEL, F, get, put, sine_cosine, take, widest, wrap
 from fusion.kernels.layout import BLOCK, CLUSTER_SIZE, E0, E1, E2, E3, E4, E5, Float32s, Float64s, Int32s, T, X, Y
 from fusion.kernels.random import U, normal_pair, threefry
 
@@ -17,6 +17,7 @@ def three_normals(
 
     A counter gives six normals, which is enough for two particles: one of each half of the block.
     """
+    widest()
     words = (key[0], key[1], key[2], key[3])
     first, other = start // 2, row + BLOCK // 2
     for j in range(min(n, BLOCK // 2)):
@@ -29,6 +30,7 @@ def three_normals(
 @numba.njit(**KERNEL)
 def fetch(source: Float32s, ancestors: Int32s, start: int, n: int, s: Float32s) -> None:
     """Read the ancestors of a block, or the block itself when nothing has been resampled."""
+    widest()
     size = source.size // 3
     for axis in range(3):
         offset = axis * size
@@ -44,6 +46,7 @@ def fetch(source: Float32s, ancestors: Int32s, start: int, n: int, s: Float32s) 
 @numba.njit(**KERNEL)
 def regularise(n: int, motion: Float64s, s: Float32s) -> None:
     """Draw a block towards the mean and add kernel noise, see `fusion.particles.regularisation`."""
+    widest()
     mx, my, mt, shrink = F(motion[14]), F(motion[15]), F(motion[16]), F(motion[17])
     r00, r10, r11 = F(motion[18]), F(motion[21]), F(motion[22])
     r20, r21, r22 = F(motion[24]), F(motion[25]), F(motion[26])
@@ -58,6 +61,7 @@ def regularise(n: int, motion: Float64s, s: Float32s) -> None:
 @numba.njit(**KERNEL)
 def regularise_in_clusters(start: int, n: int, labels: Int32s, clusters: Float32s, s: Float32s) -> None:
     """As `regularise`, with the mean, factor and root of each particle's own cluster: `CLUSTER_SIZE` numbers each."""
+    widest()
     for j in range(n):
         c = np.int32(take(labels, np.int32(start + j)) * np.int32(CLUSTER_SIZE))
         mx, my, mt = take(clusters, c), take(clusters, np.int32(c + 1)), take(clusters, np.int32(c + 2))
@@ -78,6 +82,7 @@ def regularise_in_clusters(start: int, n: int, labels: Int32s, clusters: Float32
 @numba.njit(**KERNEL)
 def advance(n: int, motion: Float64s, s: Float32s) -> None:
     """Compose a block with the increment and its noise."""
+    widest()
     dx, dy, dt = F(motion[0]), F(motion[1]), F(motion[2])
     r00, r10, r11 = F(motion[3]), F(motion[6]), F(motion[7])
     r20, r21, r22 = F(motion[9]), F(motion[10]), F(motion[11])

@@ -6,7 +6,7 @@ Particles that are weighed one after the other then read the same part of a like
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import KERNEL, F, larger, put, take
+from fusion.kernels.float_math import KERNEL, F, larger, put, take, widest
 from fusion.kernels.layout import BLOCK, Float32s, Float64s, Int32s
 
 SIDE = 64
@@ -28,6 +28,7 @@ def find_tiles(first: int, last: int, source: Float32s, ancestors: Int32s, box: 
     tiles
         (N,) to fill.
     """
+    widest()
     many = source.size // 3
     xs, ys = source[:many], source[many : 2 * many]
     west, south, along, up = F(box[0]), F(box[1]), F(box[2]), F(box[3])

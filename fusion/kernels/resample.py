@@ -10,7 +10,7 @@ Source of systematic resampling: Kitagawa, "Monte Carlo filter and smoother", 19
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import COPIES, KERNEL, put_copies
+from fusion.kernels.float_math import COPIES, KERNEL, put_copies, widest
 from fusion.kernels.layout import BLOCK, LARGEST, WEIGHT, Float32s, Float64s, Int32s
 
 _LANE = BLOCK // 4  # four running sums that do not wait for each other
@@ -77,6 +77,7 @@ def spread_blocks(
     ancestors
         (n,) to fill.
     """
+    widest()
     before, firsts = np.empty(BLOCK + 1), np.empty(BLOCK + 1, np.int64)
     for block in range(first, last):
         low, high = int(np.ceil(edges[block] - offset)), int(np.ceil(edges[block + 1] - offset))

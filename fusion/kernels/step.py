@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels.float_math import KERNEL, F
+from fusion.kernels.float_math import KERNEL, F, widest
 from fusion.kernels.layout import (
     ADDED,
     BLOCK,
@@ -90,6 +90,7 @@ def step_blocks(
     sums
         (blocks, SUMS), the moments of each block.
     """
+    widest()
     count = cloud.size // 3
     s = np.empty(SCRATCH_SIZE, np.float32)
     everyone = np.empty(0, np.int32)

@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import INLINED, KERNEL, F, exp, get, larger, log, put, take
+from fusion.kernels.float_math import INLINED, KERNEL, F, exp, get, larger, log, put, take, widest
 from fusion.kernels.layout import (
     ADDED,
     BIN_STRIDE,
@@ -57,6 +57,7 @@ def _level(value: np.float32, scale: np.float32, shift: np.float32, before: np.f
 @numba.njit(**KERNEL)
 def weigh_by_volume(n: int, table: Float32s, look: Float64s, s: Float32s) -> None:
     """ln density of a block under a volume that has the headings of a cell side by side."""
+    widest()
     rows, cols, bins = np.int32(look[ROWS]), np.int32(look[COLS]), np.int32(look[BINS])
     cs, c0, rs, r0, ks = F(look[0]), F(look[1]), F(look[2]), F(look[3]), F(look[4])
     scale, shift, before, floor = F(look[5]), F(look[6]), F(look[7]), F(look[8])
@@ -111,6 +112,7 @@ def weigh_by_maps(
     s: Float32s,
 ) -> None:
     """ln density of a block under a map of positions and, at every pixel, a distribution of headings."""
+    widest()
     rows, cols, bins = np.int32(look[ROWS]), np.int32(look[COLS]), np.int32(look[BINS])
     pixel_stride, bin_stride = np.int32(look[PIXEL_STRIDE]), np.int32(look[BIN_STRIDE])
     cs, c0, rs, r0, ks = F(look[0]), F(look[1]), F(look[2]), F(look[3]), F(look[4])
