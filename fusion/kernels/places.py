@@ -6,7 +6,7 @@ Particles that are weighed one after the other then read the same part of a like
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import KERNEL, F, larger, put, take, widest
+from fusion.kernels.float_math import KERNEL, F, get, larger, near, put, take, widest
 from fusion.kernels.layout import BLOCK, Float32s, Float64s, Int32s
 
 SIDE = 64
@@ -42,19 +42,22 @@ def find_tiles(first: int, last: int, source: Float32s, ancestors: Int32s, box: 
 @numba.njit(**KERNEL)
 def sort_by_tile(ancestors: Int32s, tiles: Int32s, ordered: Int32s) -> None:
     """Write the ancestors (N,) into `ordered` by their tiles (N,)."""
-    places, stream = np.zeros(SIDE * SIDE + 1, np.int32), len(ancestors) // _STREAMS
+    places, count = np.zeros(SIDE * SIDE + 1, np.int32), len(ancestors)
+    stream = count // _STREAMS
     for i in range(stream):
         for part in range(_STREAMS):
-            places[tiles[part * stream + i] + 1] += 1
-    for i in range(_STREAMS * stream, len(ancestors)):
+            after = np.int64(near(tiles, part * stream + i)) + 1
+            put(places, after, np.int32(get(places, after) + 1))
+    for i in range(_STREAMS * stream, count):
         places[tiles[i] + 1] += 1
     for tile in range(SIDE * SIDE):
         places[tile + 1] += places[tile]
     for i in range(stream):
         for part in range(_STREAMS):
-            tile = tiles[part * stream + i]
-            ordered[places[tile]] = ancestors[part * stream + i]
-            places[tile] += 1
-    for i in range(_STREAMS * stream, len(ancestors)):
+            tile = np.int64(near(tiles, part * stream + i))
+            place = get(places, tile)
+            put(ordered, np.int64(place), near(ancestors, part * stream + i))
+            put(places, tile, np.int32(place + 1))
+    for i in range(_STREAMS * stream, count):
         ordered[places[tiles[i]]] = ancestors[i]
         places[tiles[i]] += 1
