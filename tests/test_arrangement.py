@@ -69,7 +69,7 @@ def drive(threads=1, looking=False, resumed=False, seed=5):
             particles.particles, particles.estimate(step)
         report = particles.update(vague(step))
         if looking:
-            particles.log_weights, particles.particles
+            particles.log_weights, particles.estimate(step, max_modes=2)
         state = particles.state()
         if resumed:
             particles = ParticleFilter.from_state(state, particles.settings)

@@ -46,12 +46,12 @@ def sort_by_tile(ancestors: Int32s, tiles: Int32s, ordered: Int32s) -> None:
     stream = count // _STREAMS
     for i in range(stream):
         for part in range(_STREAMS):
-            after = np.int64(near(tiles, part * stream + i)) + 1
-            put(places, after, np.int32(get(places, after) + 1))
+            tile = np.int64(near(tiles, part * stream + i))
+            put(places, tile + 1, np.int32(get(places, tile + 1) + 1))
     for i in range(_STREAMS * stream, count):
         places[tiles[i] + 1] += 1
-    for tile in range(SIDE * SIDE):
-        places[tile + 1] += places[tile]
+    for one in range(SIDE * SIDE):
+        places[one + 1] += places[one]
     for i in range(stream):
         for part in range(_STREAMS):
             tile = np.int64(near(tiles, part * stream + i))

@@ -92,7 +92,7 @@ def spread_blocks(
         _running(start, n, weights, before)
         scale, shift = (edges[block + 1] - edges[block]) / before[n], edges[block] - offset
         for j in range(n):
-            firsts[j] = min(max(np.int64(np.ceil(before[j] * scale + shift)), low), high)
+            firsts[j] = np.int64(min(max(np.ceil(before[j] * scale + shift), low), high))
         firsts[0], firsts[n] = low, high
         j = 0
         while firsts[j] <= high - COPIES:

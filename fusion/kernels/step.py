@@ -1,7 +1,7 @@
 """One step of a particle filter in blocks that stay in the first cache: move, weigh, moments; compiled by numba.
 
 A cloud is kept as float32 x, y, yaw in three arrays (a 3 x N matrix), positions relative to an anchor near the cloud,
-so that a position within 64 m of it is exact to 4 micrometres. A block is 1024 particles. Every block reads its
+so that a position within 64 m of it is exact to 4 micrometres. A block is 512 particles. Every block reads its
 particles through the ancestors that resampling has chosen, adds kernel noise and motion noise from a counter-based
 generator, interpolates the log density of a `Lookup`, updates the log weights and sums the moments. Blocks do not
 share anything, and their sums are added in a fixed order, so threads can take any range of blocks and the result

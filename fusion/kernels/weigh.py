@@ -54,6 +54,13 @@ def _level(value: np.float32, scale: np.float32, shift: np.float32, before: np.f
     return scale * value + shift if value > before else floor
 
 
+@numba.njit(**INLINED)
+def _mix_outliers(n: int, inlier: np.float32, uniform: np.float32, s: Float32s) -> None:
+    """Mix the uniform density into ln densities: a loop of its own, so that more particles are under way at once."""
+    for j in range(n):
+        s[ADDED + j] = log(inlier * exp(s[ADDED + j]) + uniform)
+
+
 @numba.njit(**KERNEL)
 def weigh_by_volume(n: int, table: Float32s, look: Float64s, s: Float32s) -> None:
     """ln density of a block under a volume that has the headings of a cell side by side."""
@@ -87,7 +94,8 @@ def weigh_by_volume(n: int, table: Float32s, look: Float64s, s: Float32s) -> Non
         north, far = nw + cw * (ne - nw), sw + cw * (se - sw)
         total = larger(north + rw * (far - north), floor)
         inside = (u >= F(0.0)) & (u <= F(cols)) & (v >= F(0.0)) & (v <= F(rows))
-        put(s, ADDED + j, log(inlier * exp(total if inside else floor) + uniform))
+        put(s, ADDED + j, total if inside else floor)
+    _mix_outliers(n, inlier, uniform, s)
 
 
 @numba.njit(**INLINED)
@@ -136,4 +144,5 @@ def weigh_by_maps(
         north, far = nw + cw * (ne - nw), sw + cw * (se - sw)
         total = north + rw * (far - north)
         inside = (u >= F(0.0)) & (u <= F(cols)) & (v >= F(0.0)) & (v <= F(rows))
-        put(s, ADDED + j, log(inlier * exp(total if inside else floor) + uniform))
+        put(s, ADDED + j, total if inside else floor)
+    _mix_outliers(n, inlier, uniform, s)

@@ -17,7 +17,7 @@ from fusion.kernels.cloud_clusters import gather_copies
 from fusion.kernels.moments import arc_blocks, combined
 from fusion.kernels.step import step_blocks
 from fusion.particles.arrangement import arrange, is_spread_out
-from fusion.particles.lookup import NO_SLOTS, NO_TABLE, Lookup
+from fusion.particles.lookup import NO_TABLE, NO_TABLES, Lookup
 from fusion.particles.moments import Moments, lower_root, wrapped
 from fusion.particles.regularisation import cluster_kernels, silverman_bandwidth
 from fusion.particles.shared_work import find_ancestors, share
@@ -173,12 +173,10 @@ class Cloud:
     def arrange(self) -> None:
         """Put the copies just ordered in the order of their places, if that is worth it: it means nothing else."""
         if is_spread_out(self._count, self.moments()):
-            copies, tiles, ordered = (
-                self._ancestors,
-                *(self._buffer(name, self._count, np.int32) for name in ("tiles", "ordered")),
-            )
-            arrange(self._threads, self._xyt, copies, self.moments(), tiles, ordered)
-            self._ancestors, self._spare["tiles"], self._spare["ordered"] = ordered, tiles, copies
+            tiles, ordered = (self._buffer(name, self._count, np.int32) for name in ("tiles", "ordered"))
+            arrange(self._threads, self._xyt, self._ancestors, self.moments(), tiles, ordered)
+            self._spare["tiles"], self._spare["ordered"] = tiles, self._ancestors
+            self._ancestors = ordered
 
     def regularise(self, width: float) -> None:
         """Order kernel noise of `width` standard deviations, with shrinkage, on top of resampling."""
@@ -269,11 +267,7 @@ class Cloud:
         if len(self._weights) != self._count:
             self._weights = np.empty(self._count, np.float32)
         ordered = (source, self._ancestors, self._labels, self._clusters, motion, self._key, self._epoch, cloud)
-        weigh = (
-            (at.NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS)
-            if lookup is None
-            else (lookup.mode, lookup.table, lookup.location, lookup.slots)
-        )
+        weigh = NO_TABLES if lookup is None else (lookup.mode, lookup.table, lookup.location, lookup.slots)
         summed = (look, self._log_weights, out, self._weights, self._sums)
         share(self._threads, step_blocks, blocks, *ordered, *weigh, *summed)
         return combined(self._sums, look)
