@@ -44,7 +44,7 @@ def particles_filter(cloud: FloatArray, lookup: Lookup) -> Callable[[], Estimate
         "M": lambda self, t, xp: moved(xp, rng),
         "logG": lambda self, t, xp, x: np.log(mixture(lookup, x)) if t else np.zeros(len(x)),
     }
-    drive = type("Drive", (FeynmanKac,), methods)(T=4)
+    drive = type("Drive", (FeynmanKac,), methods)(T=100)
     smc = SMC(fk=drive, N=len(cloud), resampling="systematic", ESSrmin=2.0)
     next(smc)
 

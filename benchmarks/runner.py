@@ -44,11 +44,15 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Implementations of the same work on the same input; the first is the one that the others are measured against."""
+    """Implementations of the same work on the same input; the first is the one that the others are measured against.
+
+    A run does the work `steps` times in a row; the times are those of one.
+    """
 
     name: str
     size: int
     candidates: tuple[Candidate, ...]
+    steps: int = 1
 
 
 def time_case(benchmark: str, case: Case, runs: int) -> list[Row]:
@@ -58,8 +62,9 @@ def time_case(benchmark: str, case: Case, runs: int) -> list[Row]:
         for taken, candidate in zip(seconds, case.candidates, strict=True):
             work = candidate.prepare()
             start = perf_counter()
-            work()
-            taken.append(perf_counter() - start)
+            for _ in range(case.steps):
+                work()
+            taken.append((perf_counter() - start) / case.steps)
     return [
         Row(
             benchmark=benchmark,

@@ -280,6 +280,7 @@ class ParticleFilter:
         else:
             weights = np.exp(cloud.log_weights())
             cloud.keep(RESAMPLERS[self.settings.resampler](weights, count, self._rng).astype(np.int32))
+        cloud.arrange()
         if scale > 0.0:
             if is_compact(moments.covariance):
                 cloud.regularise(scale * silverman_bandwidth(count, 3))

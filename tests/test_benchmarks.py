@@ -32,7 +32,7 @@ from benchmarks.filter_packages import missing_packages, package_candidates
 from benchmarks.plots import write_plots
 from benchmarks.runner import WARM_UP_RUNS
 from benchmarks.training_cost import training_cost
-from fusion import GridFilter, se2
+from fusion import GridFilter, ParticleFilter, se2
 from learned.bev import BevSettings
 from learned.rotmatch import RotMatchNet, RotMatchSettings
 from sequences.cli import main
@@ -106,6 +106,25 @@ def test_runs_take_turns_on_fresh_states_and_only_work_is_on_the_clock(monkeypat
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in markdown_table(rows).splitlines()]
     assert cells[2] == ["made", "up", "7", "slow", "4e+03", "2e+03", "3", "1.00"]
     assert cells[3][-1] == "0.25"
+
+
+def test_a_run_of_several_steps_is_timed_by_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("benchmarks.runner.perf_counter", lambda: now[0])
+
+    def work() -> None:
+        now[0] += 3.0
+
+    rows = time_case("made", Case("again", 7, (Candidate("ours", lambda: work),), steps=4), runs=2)
+    assert (rows[0]["seconds_median"], rows[0]["seconds_min"], now[0]) == (3.0, 3.0, 3.0 * 4 * (WARM_UP_RUNS + 2))
+
+
+def test_a_cloud_all_over_the_crop_stays_there_for_the_steps_that_are_timed() -> None:
+    volume, count = filter_step._flat(example_volume()), 2000
+    particles = ParticleFilter(cloud(volume, count, spread=True), 0, filter_step.SAME_WORK)
+    for _ in range(filter_step.SPREAD_STEPS):
+        _, covariance = filter_step.skyfix_step(particles, volume)
+    assert (np.sqrt(np.diag(covariance)) > [12.0, 12.0, 1.5]).all()
 
 
 def test_thread_statement_does_not_claim_one_thread_that_was_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -154,6 +154,24 @@ def test_survey_and_mass_are_numpy_s():
     assert least == used.min()
 
 
+@pytest.mark.parametrize("spread", [0.0, 0.3, 3.0, 30.0])
+@pytest.mark.parametrize(("count", "copies"), [(1, 1), (7, 100), (511, 511), (512, 3), (3000, 3000), (3000, 17)])
+@pytest.mark.parametrize("offset", [0.0, 0.37, 0.999])
+def test_ancestors_are_those_of_systematic_resampling(spread, count, copies, offset):
+    """Every particle gets its share of the copies rounded down or up, and the copies lie where they should."""
+    log_weights = np.random.default_rng(count).normal(0.0, spread, count)
+    cloud = Cloud(np.arange(3.0 * count).reshape(count, 3) / count, log_weights, KEY)
+    cloud.resample(copies, offset)
+    chosen = cloud._ancestors
+    edges = np.cumsum(np.exp(log_weights - log_weights.max()))
+    edges = np.concatenate([[0.0], edges * copies / edges[-1]])
+    points = np.arange(copies) + offset
+    slack = 1e-6 * copies
+    assert (np.diff(chosen) >= 0).all()
+    assert (edges[chosen] <= points + slack).all()
+    assert (edges[chosen + 1] >= points - slack).all()
+
+
 @pytest.mark.parametrize("count", [1, 1023, 1024, 1025, 5000])
 @pytest.mark.parametrize("spread", [0.02, 1.0, 3.0])
 def test_moments_are_those_of_float64(count, spread):

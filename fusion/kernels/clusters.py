@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.kernels.float_math import KERNEL, F, sine_cosine
-from fusion.kernels.layout import BLOCK, E0, E1, E2, SCRATCH_SIZE
+from fusion.kernels.layout import BLOCK, E0, E1, E2, MOTION_STREAM, SCRATCH_SIZE
 from fusion.kernels.motion import three_normals
 
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
@@ -135,7 +135,7 @@ def spread_in_clusters(
     shrink = np.sqrt(1.0 - widths * widths)
     for start in range(0, len(poses), BLOCK):
         count = min(BLOCK, len(poses) - start)
-        three_normals(start, count, np.uint32(0), key, noise)
+        three_normals(start, count, np.uint32(0), MOTION_STREAM, key, E0, noise)
         for j in range(count):
             i = start + j
             m = labels[i]

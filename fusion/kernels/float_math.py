@@ -24,10 +24,23 @@ intrinsic: Any = extending.intrinsic
 """As untyped as what it makes: a function of the compiled side, whose first argument the caller does not give."""
 
 F = np.float32
+COPIES = 8
+"""How many elements `put_copies` writes."""
 LEAST_EXPONENT, GREATEST_EXPONENT = F(-87.0), F(88.0)
 _HALF, _ONE, _TWO = F(0.5), F(1.0), F(2.0)
 _SQRT_HALF_BITS, _MANTISSA_BITS, _EXPONENT_BIAS = np.int32(0x3F3504F3), np.int32(23), np.int32(127)
 _LOG2_E, _LN_2 = F(1.44269504), F(0.69314718)
+
+
+@intrinsic
+def widest(_context: Any) -> Any:
+    """Have the loops of the calling function use the widest registers there are: LLVM keeps to half of AVX-512's."""
+
+    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')  # llvmlite's own `add` knows no widths
+        return context.get_dummy_value()
+
+    return types.void(), generate
 
 
 @intrinsic
@@ -107,6 +120,24 @@ def put(_context: Any, scratch: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(scratch, types.int64, scratch.dtype), generate
+
+
+@intrinsic
+def put_copies(_context: Any, array: Any, index: Any, value: Any) -> Any:
+    """``array[index : index + COPIES] = value`` in one store, the indices known to be inside it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        one = arguments[2].type
+        many, lane = ir.VectorType(one, COPIES), ir.IntType(32)
+        first = builder.insert_element(ir.Constant(many, ir.Undefined), arguments[2], lane(0))
+        mask = ir.Constant(ir.VectorType(lane, COPIES), [0] * COPIES)
+        spread = builder.shuffle_vector(first, ir.Constant(many, ir.Undefined), mask)
+        address = builder.bitcast(builder.gep(data, [arguments[1]], inbounds=True), many.as_pointer())
+        builder.store(spread, address, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, array.dtype), generate
 
 
 @intrinsic

@@ -11,7 +11,7 @@ Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]
 Int32s = NDArray[np.int32]
 
-BLOCK = 1024
+BLOCK = 512
 SCRATCH_SIZE = 10 * BLOCK
 """float32 numbers that one thread needs beside its particles."""
 
@@ -29,6 +29,8 @@ DELTA, ROOT, SHIFT = 0, 3, 12  # increment (3), lower root of its covariance (9,
 CENTRE, SHRINK, KERNEL_ROOT, KIND = 14, 17, 18, 27  # regularisation: mean (3), factor, root (9), which kind
 MOVED = 28  # not 0 when there is an increment, and not only resampling to carry out
 MOTION_SIZE = 29
+MOTION_STREAM, KERNEL_STREAM = np.uint32(0), np.uint32(1)
+"""Which of the random numbers of a particle and a step are noise of the motion, and which of the kernel."""
 NO_KERNEL, ONE_KERNEL, CLUSTER_KERNELS = 0.0, 1.0, 2.0
 """Kinds of regularisation: none, one kernel for everyone, one for each cluster."""
 

@@ -12,7 +12,7 @@ Source: streaming log-sum-exp with one maximum a block; circular means after Mar
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import KERNEL, F, exp, larger, sine_cosine, wrap
+from fusion.kernels.float_math import KERNEL, F, exp, larger, sine_cosine, widest, wrap
 from fusion.kernels.layout import (
     ADDED,
     ARC,
@@ -50,9 +50,17 @@ from fusion.kernels.layout import (
 
 @numba.njit(**KERNEL)
 def block_moments(
-    start: int, n: int, log_weights: Float64s, out: Float64s, look: Float64s, s: Float32s, sums: Float64s
+    start: int,
+    n: int,
+    log_weights: Float64s,
+    out: Float64s,
+    look: Float64s,
+    s: Float32s,
+    weights: Float32s,
+    sums: Float64s,
 ) -> None:
-    """New log weights of a block, and the sums of its moments about the reference pose."""
+    """New weights of a block, also as logarithms, and the sums of its moments about the reference pose."""
+    widest()
     if log_weights.size > 0:
         shift = look[LOG_SHIFT]
         for j in range(n):
@@ -71,6 +79,7 @@ def block_moments(
     xx, xy, yy, xd, yd, dd, far = F(0), F(0), F(0), F(0), F(0), F(0), F(0)
     for j in range(n):
         w = exp(s[ADDED + j] - largest)
+        s[ADDED + j] = w  # not yet among the weights: a store elsewhere may make the sums wait for a check at run time
         x, y, d = s[X + j] - rx, s[Y + j] - ry, wrap(s[T + j] - rt)
         sine, cosine = sine_cosine(d)
         total += w
@@ -88,6 +97,8 @@ def block_moments(
         yd += wd * y
         dd += wd * d
         far = larger(larger(d, -d), far)
+    for j in range(n):
+        weights[start + j] = s[ADDED + j]
     sums[0], sums[1], sums[2] = largest, total, squared
     sums[3], sums[4], sums[5], sums[6] = sum_x, sum_y, sum_s, sum_c
     sums[7], sums[8], sums[9] = xx, xy, yy
@@ -100,7 +111,7 @@ def arc_blocks(
     first: int,
     last: int,
     cloud: Float32s,
-    log_weights: Float64s,
+    weights: Float32s,
     look: Float64s,
     low: float,
     high: float,
@@ -112,13 +123,14 @@ def arc_blocks(
     ----------
     cloud
         (3 N,) x, y, yaw.
-    log_weights
-        (N,) as the pass before left them; empty for equal ones.
+    weights
+        (N,) as the pass before left them.
     look
         The reference of that pass.
     sums
-        (blocks, SUMS), in which that pass has left the largest log weight of each block.
+        (blocks, SUMS) of that pass, to which these are added.
     """
+    widest()
     count = cloud.size // 3
     rx, ry, rt = F(look[REFERENCE_X]), F(look[REFERENCE_Y]), F(look[REFERENCE_YAW])
     least, most = F(low), F(high)
@@ -126,11 +138,9 @@ def arc_blocks(
         start = block * BLOCK
         stop = min(start + BLOCK, count)
         total, sum_x, sum_y, sum_d = F(0), F(0), F(0), F(0)
-        largest = F(sums[block, LARGEST])
         for i in range(start, stop):
             d = wrap(cloud[2 * count + i] - rt)
-            w = exp(F(log_weights[i]) - largest) if log_weights.size > 0 else F(1)
-            w = w if (d >= least) & (d < most) else F(0)
+            w = weights[i] if (d >= least) & (d < most) else F(0)
             total += w
             sum_x += w * (cloud[i] - rx)
             sum_y += w * (cloud[count + i] - ry)

@@ -4,38 +4,33 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels.float_math import KERNEL, F, get, put, sine_cosine, take, wrap
+from fusion.kernels.float_math import KERNEL, F, get, put, sine_cosine, take, widest, wrap
 from fusion.kernels.layout import BLOCK, CLUSTER_SIZE, E0, E1, E2, E3, E4, E5, Float32s, Float64s, Int32s, T, X, Y
 from fusion.kernels.random import U, normal_pair, threefry
 
 
 @numba.njit(**KERNEL)
-def three_normals(start: int, n: int, step: np.uint32, key: NDArray[np.uint32], s: Float32s) -> None:
-    """Normals for n particles from `start` on, into E0, E1 and E2 of the scratch `s`."""
-    words = (key[0], key[1], key[2], key[3])
-    for j in range(n):
-        a, b, _, d = threefry((U(start + j), step, U(0), U(0)), words)
-        first, second = normal_pair(a, d)
-        third, _ = normal_pair(b, U(d >> U(10)))
-        s[E0 + j], s[E1 + j], s[E2 + j] = first, second, third
+def three_normals(
+    start: int, n: int, step: np.uint32, stream: np.uint32, key: NDArray[np.uint32], row: int, s: Float32s
+) -> None:
+    """Normals for n particles from `start` on, into three rows of the scratch `s` from `row` on: E0 or E3.
 
-
-@numba.njit(**KERNEL)
-def six_normals(start: int, n: int, step: np.uint32, key: NDArray[np.uint32], s: Float32s) -> None:
-    """Normals for n particles from `start` on, into E0 to E5 of the scratch `s`; the first three are those above."""
+    A counter gives six normals, which is enough for two particles: one of each half of the block.
+    """
+    widest()
     words = (key[0], key[1], key[2], key[3])
-    for j in range(n):
-        a, b, c, d = threefry((U(start + j), step, U(0), U(0)), words)
-        first, second = normal_pair(a, d)
-        third, fourth = normal_pair(b, U(d >> U(10)))
-        fifth, sixth = normal_pair(c, U(d >> U(20)))
-        s[E0 + j], s[E1 + j], s[E2 + j] = first, second, third
-        s[E3 + j], s[E4 + j], s[E5 + j] = fourth, fifth, sixth
+    first, other = start // 2, row + BLOCK // 2
+    for j in range(min(n, BLOCK // 2)):
+        a, b, c, d = threefry((U(first + j), step, stream, U(0)), words)
+        s[row + j], s[row + BLOCK + j] = normal_pair(a, d)
+        s[row + 2 * BLOCK + j], s[other + j] = normal_pair(b, U(d >> U(10)))
+        s[other + BLOCK + j], s[other + 2 * BLOCK + j] = normal_pair(c, U(d >> U(20)))
 
 
 @numba.njit(**KERNEL)
 def fetch(source: Float32s, ancestors: Int32s, start: int, n: int, s: Float32s) -> None:
     """Read the ancestors of a block, or the block itself when nothing has been resampled."""
+    widest()
     size = source.size // 3
     for axis in range(3):
         offset = axis * size
@@ -51,6 +46,7 @@ def fetch(source: Float32s, ancestors: Int32s, start: int, n: int, s: Float32s) 
 @numba.njit(**KERNEL)
 def regularise(n: int, motion: Float64s, s: Float32s) -> None:
     """Draw a block towards the mean and add kernel noise, see `fusion.particles.regularisation`."""
+    widest()
     mx, my, mt, shrink = F(motion[14]), F(motion[15]), F(motion[16]), F(motion[17])
     r00, r10, r11 = F(motion[18]), F(motion[21]), F(motion[22])
     r20, r21, r22 = F(motion[24]), F(motion[25]), F(motion[26])
@@ -65,6 +61,7 @@ def regularise(n: int, motion: Float64s, s: Float32s) -> None:
 @numba.njit(**KERNEL)
 def regularise_in_clusters(start: int, n: int, labels: Int32s, clusters: Float32s, s: Float32s) -> None:
     """As `regularise`, with the mean, factor and root of each particle's own cluster: `CLUSTER_SIZE` numbers each."""
+    widest()
     for j in range(n):
         c = np.int32(take(labels, np.int32(start + j)) * np.int32(CLUSTER_SIZE))
         mx, my, mt = take(clusters, c), take(clusters, np.int32(c + 1)), take(clusters, np.int32(c + 2))
@@ -85,6 +82,7 @@ def regularise_in_clusters(start: int, n: int, labels: Int32s, clusters: Float32
 @numba.njit(**KERNEL)
 def advance(n: int, motion: Float64s, s: Float32s) -> None:
     """Compose a block with the increment and its noise."""
+    widest()
     dx, dy, dt = F(motion[0]), F(motion[1]), F(motion[2])
     r00, r10, r11 = F(motion[3]), F(motion[6]), F(motion[7])
     r20, r21, r22 = F(motion[9]), F(motion[10]), F(motion[11])

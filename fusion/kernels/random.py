@@ -1,7 +1,7 @@
 """Counter-based random numbers: a pure function of a key and a counter, so that work can be done in any order.
 
-Particle i at step s gets the numbers of the counter (i, s, stream, 0) under the filter's key, whatever thread or block
-it falls into. The generator is Threefry-4x32 with 13 rounds, which the authors found to pass BigCrush with 12; its
+Under the filter's key the counter (p, s, stream, 0) gives the numbers of the p-th pair of particles at step s, whatever
+thread it falls to. The generator is Threefry-4x32 with 13 rounds, which the authors found to pass BigCrush with 12; its
 known answers are tested. 128 bits give six normals by the method of Box and Muller: three radii of 24 bits, so that
 normals reach 5.8 standard deviations, and three directions of 18 bits.
 

@@ -1,7 +1,7 @@
 """One step of a particle filter in blocks that stay in the first cache: move, weigh, moments; compiled by numba.
 
 A cloud is kept as float32 x, y, yaw in three arrays (a 3 x N matrix), positions relative to an anchor near the cloud,
-so that a position within 64 m of it is exact to 4 micrometres. A block is 1024 particles. Every block reads its
+so that a position within 64 m of it is exact to 4 micrometres. A block is 512 particles. Every block reads its
 particles through the ancestors that resampling has chosen, adds kernel noise and motion noise from a counter-based
 generator, interpolates the log density of a `Lookup`, updates the log weights and sums the moments. Blocks do not
 share anything, and their sums are added in a fixed order, so threads can take any range of blocks and the result
@@ -15,13 +15,17 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels.float_math import KERNEL, F
+from fusion.kernels.float_math import KERNEL, F, widest
 from fusion.kernels.layout import (
     ADDED,
     BLOCK,
     CLUSTER_KERNELS,
+    E0,
+    E3,
+    KERNEL_STREAM,
     KIND,
     MAPS,
+    MOTION_STREAM,
     NO_KERNEL,
     SCRATCH_SIZE,
     VOLUME,
@@ -30,7 +34,7 @@ from fusion.kernels.layout import (
     Int32s,
 )
 from fusion.kernels.moments import block_moments
-from fusion.kernels.motion import advance, fetch, regularise, regularise_in_clusters, six_normals, three_normals
+from fusion.kernels.motion import advance, fetch, regularise, regularise_in_clusters, three_normals
 from fusion.kernels.weigh import weigh_by_maps, weigh_by_volume
 
 
@@ -53,6 +57,7 @@ def step_blocks(
     look: Float64s,
     log_weights: Float64s,
     out: Float64s,
+    weights: Float32s,
     sums: Float64s,
 ) -> None:
     """Blocks `first` to `last` of one step.
@@ -80,9 +85,12 @@ def step_blocks(
         (N,) before the step; empty for equal ones, which then count as 0.
     out
         (N,) log weights after the step, not normalised.
+    weights
+        (N,) over the largest of their block.
     sums
         (blocks, SUMS), the moments of each block.
     """
+    widest()
     count = cloud.size // 3
     s = np.empty(SCRATCH_SIZE, np.float32)
     everyone = np.empty(0, np.int32)
@@ -92,10 +100,9 @@ def step_blocks(
         n = min(BLOCK, count - start)
         if motion.size > 0:
             fetch(source, ancestors, start, n, s)
-            if motion[KIND] == NO_KERNEL:
-                three_normals(start, n, word, key, s)
-            else:
-                six_normals(start, n, word, key, s)
+            three_normals(start, n, word, MOTION_STREAM, key, E0, s)
+            if motion[KIND] != NO_KERNEL:
+                three_normals(start, n, word, KERNEL_STREAM, key, E3, s)
                 if motion[KIND] == CLUSTER_KERNELS:
                     regularise_in_clusters(start, n, labels, clusters, s)
                 else:
@@ -113,4 +120,4 @@ def step_blocks(
         else:
             for j in range(n):
                 s[ADDED + j] = F(0)
-        block_moments(start, n, log_weights, out, look, s, sums[block])
+        block_moments(start, n, log_weights, out, look, s, weights, sums[block])

@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import INLINED, KERNEL, F, exp, get, larger, log, put, take
+from fusion.kernels.float_math import INLINED, KERNEL, F, exp, get, larger, log, put, take, widest
 from fusion.kernels.layout import (
     ADDED,
     BIN_STRIDE,
@@ -54,9 +54,17 @@ def _level(value: np.float32, scale: np.float32, shift: np.float32, before: np.f
     return scale * value + shift if value > before else floor
 
 
+@numba.njit(**INLINED)
+def _mix_outliers(n: int, inlier: np.float32, uniform: np.float32, s: Float32s) -> None:
+    """Mix the uniform density into ln densities: a loop of its own, so that more particles are under way at once."""
+    for j in range(n):
+        s[ADDED + j] = log(inlier * exp(s[ADDED + j]) + uniform)
+
+
 @numba.njit(**KERNEL)
 def weigh_by_volume(n: int, table: Float32s, look: Float64s, s: Float32s) -> None:
     """ln density of a block under a volume that has the headings of a cell side by side."""
+    widest()
     rows, cols, bins = np.int32(look[ROWS]), np.int32(look[COLS]), np.int32(look[BINS])
     cs, c0, rs, r0, ks = F(look[0]), F(look[1]), F(look[2]), F(look[3]), F(look[4])
     scale, shift, before, floor = F(look[5]), F(look[6]), F(look[7]), F(look[8])
@@ -86,7 +94,8 @@ def weigh_by_volume(n: int, table: Float32s, look: Float64s, s: Float32s) -> Non
         north, far = nw + cw * (ne - nw), sw + cw * (se - sw)
         total = larger(north + rw * (far - north), floor)
         inside = (u >= F(0.0)) & (u <= F(cols)) & (v >= F(0.0)) & (v <= F(rows))
-        put(s, ADDED + j, log(inlier * exp(total if inside else floor) + uniform))
+        put(s, ADDED + j, total if inside else floor)
+    _mix_outliers(n, inlier, uniform, s)
 
 
 @numba.njit(**INLINED)
@@ -111,6 +120,7 @@ def weigh_by_maps(
     s: Float32s,
 ) -> None:
     """ln density of a block under a map of positions and, at every pixel, a distribution of headings."""
+    widest()
     rows, cols, bins = np.int32(look[ROWS]), np.int32(look[COLS]), np.int32(look[BINS])
     pixel_stride, bin_stride = np.int32(look[PIXEL_STRIDE]), np.int32(look[BIN_STRIDE])
     cs, c0, rs, r0, ks = F(look[0]), F(look[1]), F(look[2]), F(look[3]), F(look[4])
@@ -134,4 +144,5 @@ def weigh_by_maps(
         north, far = nw + cw * (ne - nw), sw + cw * (se - sw)
         total = north + rw * (far - north)
         inside = (u >= F(0.0)) & (u <= F(cols)) & (v >= F(0.0)) & (v <= F(rows))
-        put(s, ADDED + j, log(inlier * exp(total if inside else floor) + uniform))
+        put(s, ADDED + j, total if inside else floor)
+    _mix_outliers(n, inlier, uniform, s)

@@ -16,7 +16,8 @@ from fusion.kernels import layout as at
 from fusion.kernels.cloud_clusters import gather_copies
 from fusion.kernels.moments import arc_blocks, combined
 from fusion.kernels.step import step_blocks
-from fusion.particles.lookup import NO_SLOTS, NO_TABLE, Lookup
+from fusion.particles.arrangement import arrange, is_spread_out
+from fusion.particles.lookup import NO_TABLE, NO_TABLES, Lookup
 from fusion.particles.moments import Moments, lower_root, wrapped
 from fusion.particles.regularisation import cluster_kernels, silverman_bandwidth
 from fusion.particles.shared_work import find_ancestors, share
@@ -68,7 +69,7 @@ class Cloud:
         self._ancestors = _NOBODY
         self._labels, self._clusters = _NOBODY, NO_TABLE
         self._motion: list[float] | None = None
-        self._sums = np.zeros((0, at.SUMS))
+        self._weights, self._sums = np.zeros(0, np.float32), np.zeros((0, at.SUMS))
         self._reference = (0.0, 0.0, float(poses[0, 2]))
         self._moments: Moments | None = self._pass(None, 0.0)
         self._reference = self._moments.mean
@@ -156,10 +157,8 @@ class Cloud:
     def resample(self, count: int, offset: float) -> None:
         """Order systematic resampling to `count` equally weighted particles."""
         self._settle()
-        if len(self._log_weights) == 0:
-            self._log_weights = np.zeros(self._count)
         ancestors = self._buffer("ancestors", count, np.int32)
-        find_ancestors(self._threads, self._log_weights, self._sums, offset, ancestors)
+        find_ancestors(self._threads, self._weights, self._sums, offset, ancestors)
         self.keep(ancestors)
 
     def keep(self, ancestors: NDArray[np.int32]) -> None:
@@ -170,6 +169,14 @@ class Cloud:
         self._ancestors, self._count = ancestors, len(ancestors)
         self._log_weights, self._shift, self._log_total = _EQUAL, 0.0, log(len(ancestors))
         self._epoch += 1
+
+    def arrange(self) -> None:
+        """Put the copies just ordered in the order of their places, if that is worth it: it means nothing else."""
+        if is_spread_out(self._count, self.moments()):
+            tiles, ordered = (self._buffer(name, self._count, np.int32) for name in ("tiles", "ordered"))
+            arrange(self._threads, self._xyt, self._ancestors, self.moments(), tiles, ordered)
+            self._spare["tiles"], self._spare["ordered"] = tiles, self._ancestors
+            self._ancestors = ordered
 
     def regularise(self, width: float) -> None:
         """Order kernel noise of `width` standard deviations, with shrinkage, on top of resampling."""
@@ -257,13 +264,12 @@ class Cloud:
         blocks = -(-self._count // at.BLOCK)
         if len(self._sums) != blocks:
             self._sums = np.zeros((blocks, at.SUMS))
+        if len(self._weights) != self._count:
+            self._weights = np.empty(self._count, np.float32)
         ordered = (source, self._ancestors, self._labels, self._clusters, motion, self._key, self._epoch, cloud)
-        weigh = (
-            (at.NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS)
-            if lookup is None
-            else (lookup.mode, lookup.table, lookup.location, lookup.slots)
-        )
-        share(self._threads, step_blocks, blocks, *ordered, *weigh, look, self._log_weights, out, self._sums)
+        weigh = NO_TABLES if lookup is None else (lookup.mode, lookup.table, lookup.location, lookup.slots)
+        summed = (look, self._log_weights, out, self._weights, self._sums)
+        share(self._threads, step_blocks, blocks, *ordered, *weigh, *summed)
         return combined(self._sums, look)
 
     def _summary(self, sums: tuple[float, ...], weigh: list[float], look: FloatArray) -> Moments:
@@ -279,7 +285,7 @@ class Cloud:
                 self._spare["log weights"] = out
         if sums[12] + abs(sums[5]) >= _WHOLE_CIRCLE:
             low, high = (-4.0, sums[5] - pi) if sums[5] > 0.0 else (sums[5] + pi, 4.0)
-            share(self._threads, arc_blocks, len(self._sums), self._xyt, self._log_weights, look, low, high, self._sums)
+            share(self._threads, arc_blocks, len(self._sums), self._xyt, self._weights, look, low, high, self._sums)
             sums = combined(self._sums, look)
         largest, self._log_total, size, x, y, turned, xx, xy, yy, xt, yt, tt, _ = sums
         self._shift = largest if len(self._log_weights) else 0.0

@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray, read_only
 from fusion.grid import MapGrid
-from fusion.kernels.layout import MAPS, VOLUME
+from fusion.kernels.layout import MAPS, NOTHING, VOLUME
 
 MOST_CELLS = 2**31 - 1
 """Cells are counted in 32 bits."""
 NO_TABLE = read_only(np.zeros(0, np.float32))
 NO_SLOTS = read_only(np.zeros(0, np.int32))
+NO_TABLES = (NOTHING, NO_TABLE, NO_TABLE, NO_SLOTS)
+"""What the step is given of a lookup when there is none: the mode and the three arrays."""
 
 
 @dataclass(slots=True, eq=False)  # made once a measurement: a frozen one takes twice as long to make

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.arrays import FloatArray
-from fusion.kernels.resample import block_masses, share_out, spread_blocks
+from fusion.arrays import Float32Array, FloatArray
+from fusion.kernels.resample import share_out, spread_blocks
 
-_LEAST_BLOCKS = 4  # a thread
+_LEAST_BLOCKS = 8  # a thread
 
 
 @cache
@@ -36,11 +36,10 @@ def share(threads: int, kernel: Any, blocks: int, *arguments: Any) -> None:
 
 
 def find_ancestors(
-    threads: int, log_weights: FloatArray, sums: FloatArray, offset: float, ancestors: NDArray[np.int32]
+    threads: int, weights: Float32Array, sums: FloatArray, offset: float, ancestors: NDArray[np.int32]
 ) -> None:
     """Fill in the ancestors (n,) of systematic resampling, see `fusion.kernels.resample`."""
     blocks = len(sums)
-    masses, edges = np.empty(blocks), np.empty(blocks + 1)
-    share(threads, block_masses, blocks, log_weights, sums, masses)
-    share_out(sums, masses, len(ancestors), edges)
-    share(threads, spread_blocks, blocks, log_weights, sums, masses, edges, offset, ancestors)
+    edges = np.empty(blocks + 1)
+    share_out(sums, len(ancestors), edges)
+    share(threads, spread_blocks, blocks, weights, edges, offset, ancestors)
