@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+KERNELS := $(VENV)/.kernels
 
 .PHONY: setup demo test benchmark lint format clean
 
@@ -16,13 +17,18 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/pip install -q -c constraints.txt --no-build-isolation -e '.[dev]'
 	@touch $@
 
-demo: setup
+# numba keeps compiled kernels by file and does not see a change in a file that they call into.
+$(KERNELS): $(READY) $(shell find fusion -name '*.py')
+	@find fusion -name '*.nb[ic]' -delete
+	@touch $@
+
+demo: setup $(KERNELS)
 	$(BIN)/skyfix demo
 
-test: setup
+test: setup $(KERNELS)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
-benchmark: setup
+benchmark: setup $(KERNELS)
 	OMP_NUM_THREADS=1 $(BIN)/skyfix benchmark
 
 lint: setup
