@@ -41,6 +41,13 @@ def train(
             metavar="CHECKPOINT",
         ),
     ] = None,
+    average: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Average these weights with the trained ones, by CONFIG's averaged_shares; may be repeated.",
+            metavar="CHECKPOINT",
+        ),
+    ] = None,
 ) -> None:
     """Train a network on scans simulated in OpenStreetMap extracts; goes on where it was stopped.
 
@@ -48,7 +55,7 @@ def train(
     """
     from sequences.train_command import TrainOptions, train_from_config
 
-    options = TrainOptions(tuple(override or ()), minutes, cache, tensorboard, initial)
+    options = TrainOptions(tuple(override or ()), minutes, cache, tensorboard, initial, tuple(average or ()))
     checkpoint = train_from_config(config, data, out, training_line, options)
     if os.environ.get("RANK", "0") == "0":  # of the processes that torchrun starts, the first speaks
         typer.echo(f"checkpoint: {checkpoint}")

@@ -58,6 +58,8 @@ class TrainOptions:
         Also write event files.
     initial
         Checkpoint of the same architecture to start from; None: fresh weights.
+    averaged
+        Checkpoints of it whose weights are averaged with the trained ones, one for each of the configuration's shares.
     """
 
     overrides: Sequence[str] = ()
@@ -65,6 +67,7 @@ class TrainOptions:
     cache_dir: Path | None = None
     tensorboard: bool = False
     initial: Path | None = None
+    averaged: Sequence[Path] = ()
 
 
 def find_extract(name: str, data_dir: Path) -> MapFeatures:
@@ -103,12 +106,13 @@ def train_from_config(
     """
     options = options or TrainOptions()
     config = read_config(config_path, options.overrides)
-    initial = None
-    if options.initial is not None:
-        initial = load_network(options.initial, config.training.network.architecture)[0].state_dict()
-        config = config.with_initial(options.initial)
-    elif config.initial_share > 0.0:
-        raise SkyfixError(f"initial_share: expected --initial with a share of {config.initial_share:g}, got none")
+    architecture = config.training.network.architecture
+    if len(options.averaged) != len(config.averaged_shares):
+        count = len(config.averaged_shares)
+        raise SkyfixError(f"averaged_shares: expected a --average for each of {count}, got {len(options.averaged)}")
+    averaged = [load_network(path, architecture)[0].state_dict() for path in options.averaged]
+    initial = None if options.initial is None else load_network(options.initial, architecture)[0].state_dict()
+    config = config.with_checkpoints(options.initial, options.averaged)
     make_folder(out_dir)
     cache_dir = options.cache_dir or out_dir / "cache"
     with joined_processes() as processes:
@@ -136,7 +140,8 @@ def train_from_config(
             command = " ".join(["skyfix train", config_path.name, *(f"--set {o}" for o in options.overrides)])
             if options.initial is not None:
                 command += f" --initial {options.initial.name}"
-            _finish(_averaged(net, initial, config.initial_share), far, config, command, path)
+            command += "".join(f" --average {path.name}" for path in options.averaged)
+            _finish(_averaged(net, averaged, config.averaged_shares), far, config, command, path)
         processes.wait()
     return path
 
@@ -221,11 +226,15 @@ def _validation_view(config: TrainConfig, validation: SimulatedSamples, folder: 
     return view
 
 
-def _averaged(net: LocalizationNet, initial: Mapping[str, Tensor] | None, share: float) -> LocalizationNet:
-    """The network with a share of the weights that it started from mixed in."""
-    if initial is not None and share > 0.0:
-        trained = on_cpu(net).state_dict()
-        net.load_state_dict({name: torch.lerp(value, initial[name], share) for name, value in trained.items()})
+def _averaged(net: LocalizationNet, others: Sequence[Mapping[str, Tensor]], shares: Sequence[float]) -> LocalizationNet:
+    """The network with shares of other weights mixed in."""
+    if others:
+        trained, rest = on_cpu(net).state_dict(), 1.0 - sum(shares)
+        mixed = {
+            name: rest * value + sum(share * other[name] for share, other in zip(shares, others, strict=True))
+            for name, value in trained.items()
+        }
+        net.load_state_dict(mixed)
     return net
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -25,16 +25,17 @@ class TrainConfig(BaseModel):
 
     Training sees scans to the reach of `training.network.bev`; afterwards the network is calibrated, and used, with
     scans to `matching_half_extent_m`, where its architecture allows another reach. Left out, that is 72 m, or the
-    network's own reach where it has but one. `initial` names the checkpoint that it started from, see `with_initial`;
-    `initial_share` is the weight of its weights in the average with the trained ones that is kept: what was learned
-    in training narrows, and half of either is at home in both domains (Wortsman et al., "Robust fine-tuning of
-    zero-shot models", CVPR 2022).
+    network's own reach where it has but one. `initial` names the checkpoint that it started from, and `averaged` those
+    whose weights are averaged with the trained ones, see `with_checkpoints`; `averaged_shares` are their shares, and
+    the rest is the trained ones'. What was learned in training narrows, and an average is at home in all domains
+    (Wortsman et al., "Model soups", ICML 2022).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     initial: str | None = None
-    initial_share: float = Field(default=0.0, ge=0.0, lt=1.0)
+    averaged: tuple[str, ...] = ()
+    averaged_shares: tuple[Annotated[float, Field(gt=0.0, lt=1.0)], ...] = ()
     extracts: dict[str, float]
     matching_half_extent_m: float | None = None
     validation_extract: str
@@ -68,17 +69,23 @@ class TrainConfig(BaseModel):
                 f"matching_half_extent_m: expected {bev.half_extent_m:g}, the one reach of {network.name}, "
                 f"got {self.matching_reach_m:g}"
             )
+        if sum(self.averaged_shares) >= 1.0:
+            raise SkyfixError(f"averaged_shares: expected a sum below 1, got {sum(self.averaged_shares):g}")
 
-    def with_initial(self, checkpoint: Path) -> TrainConfig:
-        """The same, saying by name and SHA-256 which checkpoint's weights training starts from."""
-        digest = hashlib.sha256(checkpoint.read_bytes()).hexdigest()
-        return self.model_copy(update={"initial": f"{checkpoint.name} sha256:{digest}"})
+    def with_checkpoints(self, initial: Path | None, averaged: Sequence[Path]) -> TrainConfig:
+        """The same, saying by name and SHA-256 which weights training starts from, and which are averaged in."""
+        named = [_named(path) for path in averaged]
+        return self.model_copy(update={"initial": initial and _named(initial), "averaged": tuple(named)})
 
     def with_steps(self, steps: int) -> TrainConfig:
         """The same for another number of steps."""
         content = self.model_dump(mode="json")
         content["training"]["steps"] = steps
         return TrainConfig.model_validate(content)
+
+
+def _named(checkpoint: Path) -> str:
+    return f"{checkpoint.name} sha256:{hashlib.sha256(checkpoint.read_bytes()).hexdigest()}"
 
 
 def read_config(path: Path, overrides: Sequence[str] = ()) -> TrainConfig:

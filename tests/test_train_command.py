@@ -79,21 +79,20 @@ def test_training_goes_on_from_a_checkpoint(tiny: Path, tmp_path: Path) -> None:
     with pytest.raises(SkyfixError, match="holds a training with other settings, initial"):
         train_from_config(tiny, tmp_path, tmp_path / "second", options=replace(options, initial=None))
     learned_much = ("training.learning_rate=1.0", "training.clip_norm=1e6", "training.warmup_steps=1")
-    halves = [
-        load_file(
-            train_from_config(
-                tiny,
-                tmp_path,
-                tmp_path / f"share{share}",
-                options=replace(options, overrides=(*learned_much, f"initial_share={share}")),
-            )
-        )
-        for share in (0.0, 0.25)
-    ]
+    alone = train_from_config(tiny, tmp_path, tmp_path / "alone", options=replace(options, overrides=learned_much))
+    shares = replace(options, overrides=(*learned_much, "averaged_shares=[0.5, 0.2]"), averaged=(first, alone))
+    mixed = train_from_config(tiny, tmp_path, tmp_path / "mixed", options=shares)
+    other, kept = load_file(alone), load_file(mixed)
     for name, value in before.items():
-        assert torch.allclose(halves[1][name], 0.75 * halves[0][name] + 0.25 * value, atol=1e-5), name
-    with pytest.raises(SkyfixError, match=r"initial_share: expected --initial with a share of 0\.5, got none"):
-        train_from_config(tiny, tmp_path, tmp_path / "none", options=TrainOptions(("initial_share=0.5",)))
+        assert torch.allclose(kept[name], 0.5 * other[name] + 0.5 * value, atol=1e-5), name
+    facts = json.loads(mixed.with_suffix(".json").read_text())
+    assert facts["command"].endswith("--average rotmatch.safetensors --average rotmatch.safetensors")
+    assert len(facts["config"]["averaged"]) == 2
+    with pytest.raises(SkyfixError, match="averaged_shares: expected a --average for each of 1, got 0"):
+        train_from_config(tiny, tmp_path, tmp_path / "none", options=TrainOptions(("averaged_shares=[0.5]",)))
+    with pytest.raises(SkyfixError, match=r"averaged_shares: expected a sum below 1, got 1\.2"):
+        train_from_config(tiny, tmp_path, tmp_path / "none", options=TrainOptions(("averaged_shares=[0.6, 0.6]",)))
+    assert not (tmp_path / "none").exists()
     wider = replace(options, overrides=("training.network.channels=6",))
     with pytest.raises(SkyfixError, match="the initial weights do not fit the network"):
         train_from_config(tiny, tmp_path, tmp_path / "third", options=wider)
@@ -158,17 +157,19 @@ def test_overrides_are_typed_and_checked(tiny: Path) -> None:
 
 
 def test_the_shipped_weights_configuration_is_still_one() -> None:
-    """Three stages, each from the weights of the one before: near, to the reach of matching, other maps."""
+    """Five stages, each from the weights of the one before; the last three are averaged."""
     weights = Path(sequences.__file__).parents[1] / "learned" / "weights"
-    near, far, last = (read_config(weights / f"rotmatch{stage}.yaml") for stage in ("_near", "_far", ""))
+    stages = [weights / f"rotmatch{stage}.yaml" for stage in ("_near", "_far", "_overhead", "_overgrown", "")]
+    near, far, overhead, overgrown, last = (read_config(stage) for stage in stages)
     assert near.training.network == NetworkChoice("rotmatch")
-    assert (near.matching_reach_m, near.initial_share) == (72.0, 0.0)
+    assert (near.matching_reach_m, near.averaged_shares) == (72.0, ())
     assert far.training.network.settings.bev.half_extent_m == far.matching_reach_m == 72.0
-    assert (far.initial_share, last.initial_share) == (0.5, 0.75)
-    assert last.simulation.overhead_share > 0.0
-    assert last.simulation.drivable_share > 0.0
+    assert last.training.network.settings.bev.half_extent_m == last.matching_reach_m == 72.0
+    assert overhead.simulation.overgrown_share == 0.0 < overhead.simulation.overhead_share
+    assert min(overgrown.simulation.overgrown_share, overgrown.simulation.drivable_share) > 0.0
+    assert sum(last.averaged_shares) == pytest.approx(2 / 3, abs=1e-5)
     made = TrainConfig.model_validate(json.loads((weights / "rotmatch.json").read_text(encoding="utf-8"))["config"])
-    assert made.model_copy(update={"initial": None}) == last
+    assert made.model_copy(update={"initial": None, "averaged": ()}) == last
 
 
 def test_a_cache_is_shared_by_runs_of_one_simulation_alone(tmp_path: Path) -> None:
