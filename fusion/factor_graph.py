@@ -1,4 +1,4 @@
-"""Offline smoothing of a whole drive: a chain of poses in GTSAM, with whole likelihoods as factors.
+"""Offline smoothing of a whole drive: a chain of poses with whole likelihoods as factors; with loops, a GTSAM graph.
 
 Between neighbouring nodes stands an odometry factor; on a measured node the Gaussian that has the likelihood's effect
 there, found anew in every round (see `fusion.graph.propagation`). Mixtures of a few modes can be had in place of whole
