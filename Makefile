@@ -23,7 +23,7 @@ $(KERNELS): $(READY) $(shell find fusion -name '*.py')
 	@touch $@
 
 demo: setup $(KERNELS)
-	$(BIN)/skyfix demo
+	OMP_NUM_THREADS=1 $(BIN)/skyfix demo
 
 test: setup $(KERNELS)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
