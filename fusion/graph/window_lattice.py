@@ -17,6 +17,7 @@ REACH = 4.2
 _LANES, _READ = 8, 16  # values of loops that become vector code: fixed numbers, since remainders do not
 _STEP = 1.05
 _CELL_STEP = 0.8
+_ENDLESS = F(1e9)  # bins; an infinity may be optimised away where fast arithmetic is allowed
 _HALF, _THREE_QUARTERS = F(0.5), F(0.75)
 
 
@@ -175,7 +176,7 @@ def sum_lattice(
                 turn = (turned + root[2, 0] * u0 + root[2, 1] * u1) / radians - most * stride
                 lowest = int(np.floor(turn + 0.5)) - 1
                 _profile(cells, rows, cols, bins, wraps, row, col, lowest, count, values)
-                begin, end = F(-np.inf), F(np.inf)
+                begin, end = -_ENDLESS, _ENDLESS
                 if not wraps:
                     begin, end = F(-0.5 - lowest), F(bins - 0.5 - lowest)
                 mass, flank, square = _along(
