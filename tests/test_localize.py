@@ -92,6 +92,18 @@ def test_an_odometry_whose_errors_are_known_carries_the_filter_further(made_driv
     np.testing.assert_array_equal(corrected.odometry.poses, as_it_comes.odometry.poses)  # which is shown as it came
 
 
+def test_an_odometry_that_is_known_to_be_noisy_leaves_the_filter_less_sure(made_drive: MadeDrive) -> None:
+    known = [OdometryCalibration(), OdometryCalibration(along_noise=4.0, across_noise=4.0, heading_noise=4.0)]
+    results = [run(made_drive, replace(SETTINGS, measure_every_frames=5, calibration=one)) for one in known]
+    spread = [np.linalg.det(covariances_of(result.filter)[7:]).mean() for result in results]
+    assert spread[1] > 2.0 * spread[0]
+
+
+def covariances_of(estimate: Trajectory) -> np.ndarray:
+    assert estimate.covariances is not None
+    return estimate.covariances
+
+
 def test_the_true_start_is_anywhere_in_the_prior(made_drive: MadeDrive) -> None:
     drive = load_drive(FolderSequence(made_drive.path), "wheels")
     priors = [start_prior(drive, replace(SETTINGS, seed=seed)) for seed in range(400)]
