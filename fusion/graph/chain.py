@@ -31,8 +31,11 @@ class Chain:
     @classmethod
     def of(cls, increments: Sequence[OdometryIncrement]) -> Self:
         """The motions of increments."""
-        deltas = np.array([increment.delta for increment in increments]).reshape(-1, 3)
-        return cls(deltas, np.array([increment.covariance for increment in increments]).reshape(-1, 3, 3))
+        if not increments:
+            return cls(np.empty((0, 3)), np.empty((0, 3, 3)))
+        deltas = np.concatenate([increment.delta for increment in increments]).reshape(-1, 3)
+        covariances = np.concatenate([increment.covariance for increment in increments]).reshape(-1, 3, 3)
+        return cls(deltas, covariances)
 
     def between(self, nodes: IntArray) -> "Chain":
         """The motions between neighbours among `nodes` (M,), increasing: composed, covariances to first order."""

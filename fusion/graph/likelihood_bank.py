@@ -1,11 +1,14 @@
 """All likelihoods of a drive side by side, so that one compiled pass answers for all of them."""
 
 from collections.abc import Sequence
+from copy import copy
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion import se2
-from fusion.arrays import FloatArray
+from fusion.arrays import FloatArray, IntArray
 from fusion.graph.patch import LikelihoodPatch
 from fusion.graph.window_kernel import window_moments
 from fusion.graph.windowed import Windowed, roots_of
@@ -25,24 +28,19 @@ class LikelihoodBank:
     def __init__(self, patches: Sequence[LikelihoodPatch], outlier_probability: float) -> None:
         self._patches = tuple(patches)  # keeps the cells alive
         self._outlier = outlier_probability
-        tables = [
-            (patch.log_prob.__array_interface__["data"][0], *patch.log_prob.shape, patch.wraps) for patch in patches
-        ]
+        tables = [(_address_of(patch.log_prob), *patch.log_prob.shape, patch.bin_count) for patch in patches]
         self._tables = np.array(tables, dtype=np.int64).reshape(-1, 5)
-        places = [
-            (
-                *patch.first_centre,
-                patch.grid.metres_per_pixel,
-                se2.TWO_PI / patch.bin_count,
-                patch.floor,
-                patch.log_uniform,
-            )
-            for patch in patches
-        ]
-        self._places = np.array(places).reshape(-1, 7)
+        self._tables[:, 4] = self._tables[:, 3] == self._tables[:, 4]
+        self._places = _places_of(patches)
 
     def __len__(self) -> int:
-        return len(self._patches)
+        return len(self._tables)
+
+    def some(self, places: IntArray) -> "LikelihoodBank":
+        """Those at some places (K,)."""
+        same = copy(self)
+        same._tables, same._places = self._tables[places], self._places[places]
+        return same
 
     def windowed(self, centres: FloatArray, covariances: FloatArray) -> Windowed:
         """Moments under windows with centres (M, 3) and covariances (M, 3, 3), map frame."""
@@ -64,3 +62,21 @@ class LikelihoodBank:
     def outlier_share(self, log_mass: FloatArray) -> FloatArray:
         """Probability (M,) that each is an outlier, given the evidence under its window."""
         return np.asarray(self._outlier * np.exp(np.minimum(self._places[:, 6] - log_mass, 700.0)))
+
+
+def _places_of(patches: Sequence[LikelihoodPatch]) -> FloatArray:
+    """(M, 7), see `fusion.graph.window_kernel.window_moments`."""
+    grids = [(patch.grid.metres_per_pixel, patch.grid.x0, patch.grid.y0, patch.grid.rows) for patch in patches]
+    metres, x0, y0, rows = np.array(grids, dtype=np.float64).reshape(-1, 4).T
+    others = [(patch.first_bin, patch.bin_count, patch.floor, patch.log_uniform) for patch in patches]
+    first_bin, bin_count, floor, log_uniform = np.array(others, dtype=np.float64).reshape(-1, 4).T
+    radians, half = se2.TWO_PI / bin_count, 0.5 * metres
+    return np.column_stack(
+        [x0 + half, y0 + rows * metres - half, first_bin * radians, metres, radians, floor, log_uniform]
+    )
+
+
+@numba.njit(cache=True)
+def _address_of(cells: NDArray[np.float32]) -> int:
+    """Where an array lies in memory."""
+    return int(cells.ctypes.data)

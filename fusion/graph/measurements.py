@@ -61,6 +61,17 @@ class Measurements:
         same.nodes = nodes
         return same
 
+    def some(self, places: IntArray) -> "Measurements":
+        """Those at some places (K,) among the M, rising."""
+        if len(places) == len(self):
+            return self
+        split = int(np.searchsorted(places, len(self._mixtures)))
+        same = copy(self)
+        same.nodes = self.nodes[places]
+        same._mixtures = self._mixtures.some(places[:split])
+        same._bank = self._bank.some(places[split:] - len(self._mixtures))
+        return same
+
     def windowed(self, centres: FloatArray, covariances: FloatArray) -> tuple[Windowed, IntArray]:
         """Moments under windows (M, 3) and (M, 3, 3); and for each (M,) the component that explains it best.
 

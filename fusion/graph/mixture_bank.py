@@ -13,6 +13,7 @@ hypothesis); sums in place of their maxima.
 """
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
@@ -53,6 +54,13 @@ class MixtureBank:
 
     def __len__(self) -> int:
         return len(self._log_weights)
+
+    def some(self, places: IntArray) -> "MixtureBank":
+        """Those at some places (K,)."""
+        same = copy(self)
+        same._log_weights, same._means = self._log_weights[places], self._means[places]
+        same._covariances = self._covariances[places]
+        return same
 
     def windowed(self, centres: FloatArray, covariances: FloatArray) -> tuple[Windowed, IntArray]:
         """Moments under windows (M, 3) and (M, 3, 3), and the best component of each, -1 for clutter."""

@@ -5,10 +5,13 @@ Source: Minka, "Expectation propagation for approximate Bayesian inference", UAI
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion import se2
-from fusion.arrays import FloatArray
+from fusion.arrays import FloatArray, IntArray
+from fusion.graph.chain_algebra import OPTIONS, wrap
 from fusion.graph.covariances import raised
 from fusion.graph.inverses import inverses
 
@@ -44,11 +47,22 @@ class Sites:
         precision = (1.0 - share) * mine.precision + share * other.precision
         return Sites(other.reference, precision, (1.0 - share) * mine.information + share * other.information)
 
+    def at(self, places: IntArray) -> "Sites":
+        """Those at some places (K,)."""
+        return Sites(self.reference[places], self.precision[places], self.information[places])
+
+    def with_others(self, places: IntArray, others: "Sites") -> "Sites":
+        """With others at some places (K,)."""
+        found = Sites(self.reference.copy(), self.precision.copy(), self.information.copy())
+        found.reference[places], found.precision[places] = others.reference, others.precision
+        found.information[places] = others.information
+        return found
+
     def costs(self, poses: FloatArray) -> FloatArray:
         """Minus the factors' logarithms (M,) at poses (M, 3)."""
-        off = deviations(poses, self.reference)
-        quadratic = 0.5 * np.einsum("mi,mij,mj->m", off, self.precision, off)
-        return np.asarray(quadratic - np.einsum("mi,mi->m", self.information, off))
+        found = np.empty(len(poses))
+        _costs(poses, self.reference, self.precision, self.information, found)
+        return found
 
     def cavities(self, poses: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Marginals (M, 3), (M, 3, 3) with the own factor of each divided out."""
@@ -82,3 +96,23 @@ def deviations(poses: FloatArray, reference: FloatArray) -> FloatArray:
 def no_sites(reference: FloatArray) -> Sites:
     """Factors of measurements that say nothing, at poses (M, 3)."""
     return Sites(reference, np.zeros((len(reference), 3, 3)), np.zeros((len(reference), 3)))
+
+
+@numba.njit(**OPTIONS)
+def _costs(
+    poses: NDArray[np.float64],
+    references: NDArray[np.float64],
+    precisions: NDArray[np.float64],
+    informations: NDArray[np.float64],
+    costs: NDArray[np.float64],
+) -> None:
+    off = np.empty(3)
+    for m in range(len(poses)):
+        for i in range(3):
+            off[i] = poses[m, i] - references[m, i]
+        off[2] = wrap(off[2])
+        total = 0.0
+        for i in range(3):
+            row = precisions[m, i, 0] * off[0] + precisions[m, i, 1] * off[1] + precisions[m, i, 2] * off[2]
+            total += off[i] * (0.5 * row - informations[m, i])
+        costs[m] = total
