@@ -61,6 +61,10 @@ class OdometryCalibration:
         about their distance.
     heading_bias_rad_per_m : float
         What its heading lacks per metre.
+    heading_blur_s : float
+        Standard deviation, in seconds, of the span of time over which it averages headings: a tangent that is a chord
+        does, and so does any filter. The average is undone to first order: the heading less what averaging it once
+        more would take from it.
     along_noise, across_noise, heading_noise : float
         Its noise over what was assumed, factors of standard deviations.
     scale_walk : float
@@ -69,7 +73,7 @@ class OdometryCalibration:
     Raises
     ------
     SkyfixError
-        When a value is not finite, or a factor not positive.
+        When a value is not finite, a factor not positive, or the blur negative.
     """
 
     clock_offset_s: float = 0.0
@@ -78,6 +82,7 @@ class OdometryCalibration:
     log_scale: float = 0.0
     heading_lead_m: float = 0.0
     heading_bias_rad_per_m: float = 0.0
+    heading_blur_s: float = 0.0
     along_noise: float = 1.0
     across_noise: float = 1.0
     heading_noise: float = 1.0
@@ -89,6 +94,8 @@ class OdometryCalibration:
             if not np.isfinite(value) or (factor and value <= 0.0):
                 expected = "a positive number" if factor else "a finite number"
                 raise SkyfixError(f"odometry calibration {entry.name}: expected {expected}, got {value}")
+        if self.heading_blur_s < 0.0:
+            raise SkyfixError(f"odometry calibration heading_blur_s: expected >= 0, got {self.heading_blur_s}")
 
     def corrected(self, odometry: Trajectory) -> Trajectory:
         """The odometry of the vehicle's body, carried on at both ends as it last moved."""
@@ -100,7 +107,7 @@ class OdometryCalibration:
         xy = np.exp(self.log_scale) * at.interpolate(stamps)[:, :2]
         steps = np.diff(xy, axis=0)
         way = np.append(0.0, np.cumsum(np.hypot(steps[:, 0], steps[:, 1])))
-        shown = np.unwrap(headings.interpolate(stamps)[:, 2])
+        shown = _sharpened(headings, stamps, self.heading_blur_s)
         yaw = np.interp(way - self.heading_lead_m, way, shown) if self.heading_lead_m else shown
         turned = self.heading_bias_rad_per_m * way
         bends = np.column_stack([np.zeros((len(steps), 2)), 0.5 * (turned[1:] + turned[:-1])])
@@ -130,7 +137,7 @@ class CalibrationPrior:
 
     Parameters
     ----------
-    clock_offset_s, heading_lead_s, heading_lead_m : float
+    clock_offset_s, heading_lead_s, heading_lead_m, heading_blur_s : float
         About zero.
     log_noise : float
         Of ln of the factors of noise and walk, about zero.
@@ -139,25 +146,28 @@ class CalibrationPrior:
     clock_offset_s: float = 0.1
     heading_lead_s: float = 0.1
     heading_lead_m: float = 0.7
+    heading_blur_s: float = 0.2
     log_noise: float = 0.7
 
     @property
     def sigmas(self) -> FloatArray:
-        """(7,), of what is searched for."""
-        return np.array([self.clock_offset_s, self.heading_lead_s, self.heading_lead_m, *[self.log_noise] * 4])
+        """(8,), of what is searched for."""
+        errors = [self.clock_offset_s, self.heading_lead_s, self.heading_lead_m, self.heading_blur_s]
+        return np.array([*errors, *[self.log_noise] * 4])
 
 
 _DIRECTIONS = np.array(
     [
-        [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # the clock of positions and headings
-        [0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0],  # the place of the headings,
-        [0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0],  # their clock,
-        [0.0, 0.1, -0.7, 0.0, 0.0, 0.0, 0.0],  # one for the other
-        [0.1, -0.1, 0.0, 0.0, 0.0, 0.0, 0.0],  # the clock of the positions alone
-        [0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0],  # ln of the factors: noise along,
-        [0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0],  # across,
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0],  # of the heading,
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.7],  # and the scale's walk
+        [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # the clock of positions and headings
+        [0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0],  # the place of the headings,
+        [0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # their clock,
+        [0.0, 0.1, -0.7, 0.0, 0.0, 0.0, 0.0, 0.0],  # one for the other
+        [0.1, -0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # the clock of the positions alone
+        [0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0],  # the headings' blur
+        [0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0],  # ln of the factors: noise along,
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0],  # across,
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0],  # of the heading,
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.7],  # and the scale's walk
     ]
 )
 """Steps of the search."""
@@ -210,7 +220,7 @@ def calibrate_odometry(
     if initial.covariances is not None:
         covariances = initial.covariances[np.searchsorted(initial.stamp_ns, stamps, side="right") - 1]
     values = np.zeros(len(sigmas))
-    careful = np.array([0.0, 0.0, 0.0, *[_CAUTION] * 4])
+    careful = np.array([*[0.0] * 4, *[_CAUTION] * 4])
     found = search.propagated(careful, seen, poses, covariances)
     for _ in range(_ROUNDS):
         held = found
@@ -268,13 +278,14 @@ class _Search:
 
 
 def _calibration(values: FloatArray) -> OdometryCalibration:
-    """That of values (7,) of the search; within what can be believed of an odometry."""
+    """That of values (8,) of the search; within what can be believed of an odometry."""
     clock, lead = np.clip(values[:2], -_LARGEST_S, _LARGEST_S).tolist()
-    along, across, heading, walk = np.exp(np.maximum(values[3:], _LEAST_LOG_FACTORS)).tolist()
+    along, across, heading, walk = np.exp(np.maximum(values[4:], _LEAST_LOG_FACTORS)).tolist()
     return OdometryCalibration(
         clock,
         lead,
         heading_lead_m=float(values[2]),
+        heading_blur_s=float(np.clip(values[3], 0.0, _LARGEST_S)),
         along_noise=along,
         across_noise=across,
         heading_noise=heading,
@@ -295,6 +306,17 @@ def _best_along(step: FloatArray, origin: FloatArray, cost: Callable[[FloatArray
     bend = below - 2.0 * here + above
     vertex = origin + step * (best + (0.5 * (below - above) / bend if bend > 0.0 else 0.0))
     return vertex if cost(vertex) < here else origin + best * step
+
+
+def _sharpened(headings: Trajectory, stamps: IntArray, blur_s: float) -> FloatArray:
+    """Headings (N,) at stamps, without jumps by whole turns; an average over a span of time taken out."""
+    shown: FloatArray = np.unwrap(headings.interpolate(stamps)[:, 2])
+    if blur_s == 0.0:
+        return shown
+    first, last = headings.span_ns
+    span = np.minimum(round(blur_s * 1e9), np.minimum(stamps - first, last - stamps))  # as much as there is at the ends
+    after, before = (se2.wrap(headings.interpolate(stamps + way * span)[:, 2] - shown) for way in (1, -1))
+    return shown - 0.5 * (after + before)
 
 
 def _delayed(odometry: Trajectory, seconds: float) -> Trajectory:

@@ -50,7 +50,8 @@ def read_calibration(run_dir: Path) -> OdometryCalibration:
     """The odometry's errors that a run has found, for a filter; `SkyfixError` when there are none to be read."""
     found: Any = read_metrics(run_dir).get("filter_calibration")
     try:
-        return OdometryCalibration(**{entry.name: float(found[entry.name]) for entry in fields(OdometryCalibration)})
+        known = {"heading_blur_s": 0.0, **found}  # which runs of earlier versions did not look for
+        return OdometryCalibration(**{entry.name: float(known[entry.name]) for entry in fields(OdometryCalibration)})
     except (KeyError, TypeError, ValueError, SkyfixError) as error:
         where = run_dir / METRICS_FILE
         raise SkyfixError(f"{where}: expected the numbers of a filter_calibration, got {found!r}") from error

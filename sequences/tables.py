@@ -97,7 +97,7 @@ def _calibration_line(found: OdometryCalibration) -> str:
     return (
         f"smoother: moved the odometry's stamps by {found.clock_offset_s:+.2f} s and its headings by "
         f"{found.heading_lead_s:+.2f} s, {found.heading_lead_m:+.1f} m and "
-        f"{-math.degrees(found.mount_yaw_rad):+.2f} degrees, "
+        f"{-math.degrees(found.mount_yaw_rad):+.2f} degrees, sharpened these by {found.heading_blur_s:.1f} s, "
         f"stretched its distances by {100.0 * math.expm1(found.log_scale):+.1f} %; took its noise as "
         f"{found.along_noise:.1f}, {found.across_noise:.1f} and {found.heading_noise:.1f} of what was assumed along, "
         "across and in heading"

@@ -27,7 +27,10 @@ def with_errors(truth: Trajectory, errors: OdometryCalibration) -> Trajectory:
     t = truth.stamp_ns
     inner = t[20:-20]
     xy = truth.interpolate(inner)[:, :2] / np.exp(errors.log_scale)
-    yaw = truth.interpolate(inner + round(errors.heading_lead_s * SECOND))[:, 2] + errors.mount_yaw_rad
+    span = np.sqrt(12.0) * errors.heading_blur_s * np.linspace(-0.5, 0.5, 41)  # a box with that standard deviation
+    at = inner[:, None] + np.round((errors.heading_lead_s + span) * SECOND).astype(np.int64)
+    shown = np.unwrap(truth.interpolate(np.clip(at, t[0], t[-1]).ravel())[:, 2]).reshape(at.shape)
+    yaw = shown.mean(axis=1) + errors.mount_yaw_rad
     poses = se2.compose(np.array([30.0, -7.0, 1.0]), np.column_stack([xy, yaw]))
     return Trajectory(inner - round(errors.clock_offset_s * SECOND), poses, None, "odometry")
 
@@ -75,12 +78,39 @@ def test_errors_are_found_in_turns(errors: OdometryCalibration) -> None:
     assert heading_deg < 0.5
 
 
+@pytest.mark.parametrize("blur_s", [0.0, 0.36])
+def test_headings_that_are_averages_are_sharpened(blur_s: float) -> None:
+    """Chords over 1.25 s: the span is found, and most of what they lose in turns is put back."""
+    errors = OdometryCalibration(heading_blur_s=blur_s)
+    found, heading_deg = calibrated(0.8, errors, seed=3)
+    assert found.heading_blur_s == pytest.approx(blur_s, abs=0.12)
+    assert heading_deg < 0.5
+    truth = drive(0.8)
+    odometry = with_errors(truth, errors)
+    lost, left = (
+        se2.wrap(one.interpolate(truth.stamp_ns[60:-60])[:, 2] - 1.0 - truth.poses[60:-60, 2])
+        for one in (odometry, errors.corrected(odometry))
+    )
+    assert np.abs(left).max() <= 0.1 * np.abs(lost).max() + 1e-9
+
+
+def test_sharpening_crosses_the_seam_of_headings() -> None:
+    """The same drive turned by half a circle, and only as much of the span is used as there is at the ends."""
+    errors, odometry = OdometryCalibration(heading_blur_s=0.3), drive(0.8)
+    turned = Trajectory(odometry.stamp_ns, se2.compose(np.array([0.0, 0.0, np.pi]), odometry.poses))
+    first, second = (errors.corrected(one) for one in (odometry, turned))
+    np.testing.assert_allclose(se2.wrap(second.poses[:, 2] - first.poses[:, 2] - np.pi), 0.0, atol=1e-9)
+    off = se2.wrap(first.interpolate(odometry.stamp_ns)[:, 2] - odometry.poses[:, 2])
+    assert np.abs(off).max() < 0.5 * 0.3**2 * 0.8 * 2.0 * np.pi / 8.0 * 1.1
+
+
 def test_without_evidence_clocks_are_left_alone() -> None:
     """On a straight road at constant speed no clock can be told from another."""
     found, _ = calibrated(0.0, OdometryCalibration(clock_offset_s=0.2), seed=2)
     assert abs(found.clock_offset_s) < 0.02
     assert abs(found.heading_lead_s) < 0.02
     assert abs(found.heading_lead_m) < 0.2
+    assert found.heading_blur_s < 0.05
 
 
 def test_corrected_undoes_the_errors() -> None:
@@ -137,3 +167,8 @@ def test_for_a_filter_what_wanders_is_noise() -> None:
 def test_impossible_values_are_named(name: str, value: float, expected: str) -> None:
     with pytest.raises(SkyfixError, match=f"odometry calibration {name}: expected {expected} number, got {value}"):
         OdometryCalibration(**{name: value})
+
+
+def test_a_negative_blur_is_refused() -> None:
+    with pytest.raises(SkyfixError, match="odometry calibration heading_blur_s: expected >= 0, got -0.1"):
+        OdometryCalibration(heading_blur_s=-0.1)
