@@ -170,5 +170,5 @@ def test_impossible_values_are_named(name: str, value: float, expected: str) -> 
 
 
 def test_a_negative_blur_is_refused() -> None:
-    with pytest.raises(SkyfixError, match="odometry calibration heading_blur_s: expected >= 0, got -0.1"):
+    with pytest.raises(SkyfixError, match=r"odometry calibration heading_blur_s: expected >= 0, got -0\.1"):
         OdometryCalibration(heading_blur_s=-0.1)
