@@ -1,9 +1,10 @@
 """An odometry's errors, found from the drive itself: its clock, its headings' lead, its drift, and how noisy it is.
 
 An odometry comes from another pipeline than the scans. Its stamps are a tenth of a second off; headings taken from the
-tangent of a path run ahead of the vehicle; a camera looks a little to one side; a stereo baseline is one per cent
-short, or a scale wanders. None of these is noise: they do not average out, and each is a drift, or half a degree in
-every turn. And how much noise is left differs tenfold from one pipeline to another.
+tangent of a path run ahead of the vehicle, those taken from a chord of it cut its corners; a camera looks a little to
+one side; a stereo baseline is one per cent short, or a scale wanders. None of these is noise: they do not average out,
+and each is a drift, or half a degree in every turn. And how much noise is left differs tenfold from one pipeline to
+another.
 
 With the right values odometry and map agree best. So they are those under which the measurements are most probable
 (their evidence, everything else integrated out), with a prior that keeps them usual where the drive tells nothing.
@@ -15,14 +16,13 @@ MacKay, "Bayesian interpolation", 1992 (evidence).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
-from fusion.errors import SkyfixError
 from fusion.graph.assembly import pose_graph
 from fusion.graph.chain import Chain
 from fusion.graph.measurements import Measurement, Measurements
@@ -30,105 +30,18 @@ from fusion.graph.odometry_drift import OdometryDrift
 from fusion.graph.propagation import Propagated, propagate
 from fusion.graph.smoother_settings import SmootherSettings
 from fusion.odometry import OdometryNoise
+from fusion.odometry_errors import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory, checked_stamps
 
-_NS = 1_000_000_000
+__all__ = ["CalibrationPrior", "OdometryCalibration", "calibrate_odometry"]
+
 _LARGEST_S = 0.45
 _ROUNDS = 3
 _CAUTION = 1.0  # ln of the factor by which the odometry is trusted less before its errors are known
 _LEAST_LOG_FACTORS = np.log([0.2, 0.2, 0.25, 0.1])  # jitter that comes and goes between measurements leaves no evidence
 _TRIAL_STEPS = 2
 _MOST_STEPS = 4
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryCalibration:
-    """Errors of an odometry; without any, as it comes.
-
-    Parameters
-    ----------
-    clock_offset_s : float
-        To be added to its stamps.
-    heading_lead_s : float
-        How long before its time it shows a heading, in seconds; headings are put back by as much.
-    mount_yaw_rad : float
-        Heading of its forward axis in the vehicle's body, radians counter-clockwise.
-    log_scale : float
-        ln of the true distance over the distance that it tells.
-    heading_lead_m : float
-        How far before its place, in metres: the tangent of the path of a sensor in front of the rear axle leads by
-        about their distance.
-    heading_bias_rad_per_m : float
-        What its heading lacks per metre.
-    heading_blur_s : float
-        Standard deviation, in seconds, of the span of time over which it averages headings: a tangent that is a chord
-        does, and so does any filter. The average is undone to first order: the heading less what averaging it once
-        more would take from it.
-    along_noise, across_noise, heading_noise : float
-        Its noise over what was assumed, factors of standard deviations.
-    scale_walk : float
-        How its scale wanders over what was assumed, likewise.
-
-    Raises
-    ------
-    SkyfixError
-        When a value is not finite, a factor not positive, or the blur negative.
-    """
-
-    clock_offset_s: float = 0.0
-    heading_lead_s: float = 0.0
-    mount_yaw_rad: float = 0.0
-    log_scale: float = 0.0
-    heading_lead_m: float = 0.0
-    heading_bias_rad_per_m: float = 0.0
-    heading_blur_s: float = 0.0
-    along_noise: float = 1.0
-    across_noise: float = 1.0
-    heading_noise: float = 1.0
-    scale_walk: float = 1.0
-
-    def __post_init__(self) -> None:
-        for entry in fields(self):
-            value, factor = getattr(self, entry.name), entry.default == 1.0
-            if not np.isfinite(value) or (factor and value <= 0.0):
-                expected = "a positive number" if factor else "a finite number"
-                raise SkyfixError(f"odometry calibration {entry.name}: expected {expected}, got {value}")
-        if self.heading_blur_s < 0.0:
-            raise SkyfixError(f"odometry calibration heading_blur_s: expected >= 0, got {self.heading_blur_s}")
-
-    def corrected(self, odometry: Trajectory) -> Trajectory:
-        """The odometry of the vehicle's body, carried on at both ends as it last moved."""
-        at = _delayed(odometry, self.clock_offset_s)
-        headings = _delayed(odometry, self.clock_offset_s + self.heading_lead_s)
-        first = max(at.span_ns[0], headings.span_ns[0])
-        last = min(at.span_ns[1], headings.span_ns[1])
-        stamps = np.union1d(np.clip(at.stamp_ns, first, last), [first, last])
-        xy = np.exp(self.log_scale) * at.interpolate(stamps)[:, :2]
-        steps = np.diff(xy, axis=0)
-        way = np.append(0.0, np.cumsum(np.hypot(steps[:, 0], steps[:, 1])))
-        shown = _sharpened(headings, stamps, self.heading_blur_s)
-        yaw = np.interp(way - self.heading_lead_m, way, shown) if self.heading_lead_m else shown
-        turned = self.heading_bias_rad_per_m * way
-        bends = np.column_stack([np.zeros((len(steps), 2)), 0.5 * (turned[1:] + turned[:-1])])
-        xy = xy[0] + np.vstack([np.zeros(2), np.cumsum(se2.transform_points(bends, steps), axis=0)])
-        return Trajectory(
-            stamps, np.column_stack([xy, se2.wrap(yaw + turned - self.mount_yaw_rad)]), None, odometry.frame_id
-        )
-
-    def noise(self, assumed: OdometryNoise) -> OdometryNoise:
-        """The noise that it has, given what was assumed of it."""
-        return replace(
-            assumed,
-            longitudinal_m_per_sqrt_m=self.along_noise * assumed.longitudinal_m_per_sqrt_m,
-            lateral_m_per_sqrt_m=self.across_noise * assumed.lateral_m_per_sqrt_m,
-            heading_rad_per_sqrt_m=self.heading_noise * assumed.heading_rad_per_sqrt_m,
-            heading_rad_per_sqrt_rad=self.heading_noise * assumed.heading_rad_per_sqrt_rad,
-        )
-
-    def drift(self, assumed: OdometryDrift) -> OdometryDrift:
-        """How its errors change along the way, given what was assumed of that."""
-        return replace(assumed, log_scale_walk=self.scale_walk * assumed.log_scale_walk)
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,25 +219,3 @@ def _best_along(step: FloatArray, origin: FloatArray, cost: Callable[[FloatArray
     bend = below - 2.0 * here + above
     vertex = origin + step * (best + (0.5 * (below - above) / bend if bend > 0.0 else 0.0))
     return vertex if cost(vertex) < here else origin + best * step
-
-
-def _sharpened(headings: Trajectory, stamps: IntArray, blur_s: float) -> FloatArray:
-    """Headings (N,) at stamps, without jumps by whole turns; an average over a span of time taken out."""
-    shown: FloatArray = np.unwrap(headings.interpolate(stamps)[:, 2])
-    if blur_s == 0.0:
-        return shown
-    first, last = headings.span_ns
-    span = np.minimum(round(blur_s * 1e9), np.minimum(stamps - first, last - stamps))  # as much as there is at the ends
-    after, before = (se2.wrap(headings.interpolate(stamps + way * span)[:, 2] - shown) for way in (1, -1))
-    return shown - 0.5 * (after + before)
-
-
-def _delayed(odometry: Trajectory, seconds: float) -> Trajectory:
-    """The odometry with later stamps, carried on at both ends by a second as it last moved."""
-    first, last = odometry.span_ns
-    near, far = min(first + _NS, last), max(last - _NS, first)
-    ends: FloatArray = odometry.interpolate(np.array([first, near, far, last]))
-    before = se2.compose(ends[0], se2.inverse(se2.between(ends[0], ends[1])))
-    after = se2.compose(ends[3], se2.between(ends[2], ends[3]))
-    stamps = np.concatenate([[first - _NS], odometry.stamp_ns, [last + _NS]]) + round(seconds * 1e9)
-    return Trajectory(stamps, np.concatenate([before[None], odometry.poses, after[None]]), None, odometry.frame_id)

@@ -1,0 +1,130 @@
+"""OdometryCalibration: what is wrong with an odometry besides noise, put right, and how noisy it is.
+
+Headings that are averages (chords of a path, filters) are sharpened by one step of van Cittert's iteration, "Zum
+Einfluss der Spaltbreite auf die Intensitätsverteilung in Spektrallinien", Zeitschrift für Physik, 1931: white noise
+grows to 2.1 times itself, whatever the span.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from fusion import se2
+from fusion.arrays import FloatArray, IntArray
+from fusion.errors import SkyfixError
+from fusion.graph.odometry_drift import OdometryDrift
+from fusion.odometry import OdometryNoise
+from fusion.trajectory import Trajectory
+
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryCalibration:
+    """Errors of an odometry; without any, as it comes.
+
+    Parameters
+    ----------
+    clock_offset_s : float
+        To be added to its stamps.
+    heading_lead_s : float
+        How long before its time it shows a heading, in seconds; headings are put back by as much.
+    mount_yaw_rad : float
+        Heading of its forward axis in the vehicle's body, radians counter-clockwise.
+    log_scale : float
+        ln of the true distance over the distance that it tells.
+    heading_lead_m : float
+        How far before its place, in metres: the tangent of the path of a sensor in front of the rear axle leads by
+        about their distance.
+    heading_bias_rad_per_m : float
+        What its heading lacks per metre.
+    heading_blur_s : float
+        Standard deviation, in seconds, of the span of time over which it averages headings: a tangent that is a chord
+        does, and so does any filter. The average is undone to first order: the heading less what averaging it once
+        more would take from it.
+    along_noise, across_noise, heading_noise : float
+        Its noise over what was assumed, factors of standard deviations.
+    scale_walk : float
+        How its scale wanders over what was assumed, likewise.
+
+    Raises
+    ------
+    SkyfixError
+        When a value is not finite, a factor not positive, or the blur negative.
+    """
+
+    clock_offset_s: float = 0.0
+    heading_lead_s: float = 0.0
+    mount_yaw_rad: float = 0.0
+    log_scale: float = 0.0
+    heading_lead_m: float = 0.0
+    heading_bias_rad_per_m: float = 0.0
+    heading_blur_s: float = 0.0
+    along_noise: float = 1.0
+    across_noise: float = 1.0
+    heading_noise: float = 1.0
+    scale_walk: float = 1.0
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value, factor = getattr(self, entry.name), entry.default == 1.0
+            if not np.isfinite(value) or (factor and value <= 0.0):
+                expected = "a positive number" if factor else "a finite number"
+                raise SkyfixError(f"odometry calibration {entry.name}: expected {expected}, got {value}")
+        if self.heading_blur_s < 0.0:
+            raise SkyfixError(f"odometry calibration heading_blur_s: expected >= 0, got {self.heading_blur_s}")
+
+    def corrected(self, odometry: Trajectory) -> Trajectory:
+        """The odometry of the vehicle's body, carried on at both ends as it last moved."""
+        at = _delayed(odometry, self.clock_offset_s)
+        headings = _delayed(odometry, self.clock_offset_s + self.heading_lead_s)
+        first = max(at.span_ns[0], headings.span_ns[0])
+        last = min(at.span_ns[1], headings.span_ns[1])
+        stamps = np.union1d(np.clip(at.stamp_ns, first, last), [first, last])
+        xy = np.exp(self.log_scale) * at.interpolate(stamps)[:, :2]
+        steps = np.diff(xy, axis=0)
+        way = np.append(0.0, np.cumsum(np.hypot(steps[:, 0], steps[:, 1])))
+        shown = _sharpened(headings, stamps, self.heading_blur_s)
+        yaw = np.interp(way - self.heading_lead_m, way, shown) if self.heading_lead_m else shown
+        turned = self.heading_bias_rad_per_m * way
+        bends = np.column_stack([np.zeros((len(steps), 2)), 0.5 * (turned[1:] + turned[:-1])])
+        xy = xy[0] + np.vstack([np.zeros(2), np.cumsum(se2.transform_points(bends, steps), axis=0)])
+        return Trajectory(
+            stamps, np.column_stack([xy, se2.wrap(yaw + turned - self.mount_yaw_rad)]), None, odometry.frame_id
+        )
+
+    def noise(self, assumed: OdometryNoise) -> OdometryNoise:
+        """The noise that it has, given what was assumed of it."""
+        return replace(
+            assumed,
+            longitudinal_m_per_sqrt_m=self.along_noise * assumed.longitudinal_m_per_sqrt_m,
+            lateral_m_per_sqrt_m=self.across_noise * assumed.lateral_m_per_sqrt_m,
+            heading_rad_per_sqrt_m=self.heading_noise * assumed.heading_rad_per_sqrt_m,
+            heading_rad_per_sqrt_rad=self.heading_noise * assumed.heading_rad_per_sqrt_rad,
+        )
+
+    def drift(self, assumed: OdometryDrift) -> OdometryDrift:
+        """How its errors change along the way, given what was assumed of that."""
+        return replace(assumed, log_scale_walk=self.scale_walk * assumed.log_scale_walk)
+
+
+def _sharpened(headings: Trajectory, stamps: IntArray, blur_s: float) -> FloatArray:
+    """Headings (N,) at stamps, without jumps by whole turns; an average over a span of time taken out."""
+    shown: FloatArray = np.unwrap(headings.interpolate(stamps)[:, 2])
+    if blur_s == 0.0:
+        return shown
+    first, last = headings.span_ns
+    span = np.minimum(round(blur_s * 1e9), np.minimum(stamps - first, last - stamps))  # as much as there is at the ends
+    after, before = (se2.wrap(headings.interpolate(stamps + way * span)[:, 2] - shown) for way in (1, -1))
+    return shown - 0.5 * (after + before)
+
+
+def _delayed(odometry: Trajectory, seconds: float) -> Trajectory:
+    """The odometry with later stamps, carried on at both ends by a second as it last moved."""
+    first, last = odometry.span_ns
+    near, far = min(first + _NS, last), max(last - _NS, first)
+    ends: FloatArray = odometry.interpolate(np.array([first, near, far, last]))
+    before = se2.compose(ends[0], se2.inverse(se2.between(ends[0], ends[1])))
+    after = se2.compose(ends[3], se2.between(ends[2], ends[3]))
+    stamps = np.concatenate([[first - _NS], odometry.stamp_ns, [last + _NS]]) + round(seconds * 1e9)
+    return Trajectory(stamps, np.concatenate([before[None], odometry.poses, after[None]]), None, odometry.frame_id)
