@@ -59,7 +59,7 @@ class Looks:
         moves = np.empty(len(centres))
         _measure_moves(self._centres, self._roots, centres, windows, moves)
         left = (1.0 - _DAMPING) * self._errors + self._slopes * moves
-        places = np.flatnonzero(~((left <= _TOLERANCE) & (moves <= _FARTHEST)))  # NaN is for the look to refuse
+        places = np.flatnonzero(~((left <= _TOLERANCE) & (moves <= _FARTHEST)))  # NaN too, which the step refuses
         if len(places) == 0:
             return
         centres, windows = np.ascontiguousarray(centres[places]), np.ascontiguousarray(windows[places])
