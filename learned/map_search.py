@@ -44,8 +44,9 @@ class MapSearchSettings:
         At most so many of the best coarse cells are looked at closely, with their neighbours on all sides.
     range_nats
         Cells this far below the best are not looked at closely.
-    contrast_cell_m, contrast_heading_deg
-        Wanted size of a cell where only the contrast is asked for: coarser, as it is asked for often.
+    contrast_cell_m, contrast_heading_deg, contrast_places
+        Wanted size of a cell where only the contrast is asked for, and how many places are then looked at closely:
+        coarser and fewer, as it is asked for often.
     """
 
     cell_m: float = 3.0
@@ -54,6 +55,7 @@ class MapSearchSettings:
     range_nats: float = 12.0
     contrast_cell_m: float = 5.0
     contrast_heading_deg: float = 9.0
+    contrast_places: int = 6
 
     def __post_init__(self) -> None:
         if not all(getattr(self, entry.name) > 0 for entry in fields(self)):
@@ -163,7 +165,7 @@ class MapSearch:
             raise SkyfixError(f"scan features: expected {expected}, got {tuple(scan.shape)}")
         with torch.inference_mode():
             coarse = self._coarse_scores(scan)
-            centres = self._best_places(coarse)
+            centres = self._best_places(coarse, self.settings.places)
             if near is not None and len(near):
                 centres = np.unique(np.concatenate([centres, self._cells_of(near)]), axis=0)
             cut, fine = self._closely(scan, centres)
@@ -172,17 +174,25 @@ class MapSearch:
         return TwoLevelLikelihood.from_scores(lifted, self.lattice.coarse, cut, fine)
 
     def contrast(self, scan: Tensor, pose: FloatArray) -> float:
-        """Highest coarse score on the map less the highest near a pose (3,): within some 10 m and 10 degrees."""
+        """Highest score on the map less the highest near a pose (3,): within some 10 m and 10 degrees.
+
+        Coarse scores say where to look closely: at the best few places of the map, and at the best one near the pose.
+        """
+        lattice, vote = self.lattice, self._contrast
         with torch.inference_mode():
-            scores = self._contrast.scores(scan)
-        grid, bins = self._contrast.grid, self._contrast.bins
-        reach, half_turn = round(_NEAR_M / grid.metres_per_pixel), round(_NEAR_RAD * bins / se2.TWO_PI)
-        row, col = (math.floor(at) for at in grid.pixel_from_xy(pose[:2]))
-        turn = round(float(pose[2]) * bins / se2.TWO_PI)
-        yaws = np.arange(turn - half_turn, turn + half_turn + 1) % bins
-        near = scores[max(row - reach, 0) : max(row + reach + 1, 0), max(col - reach, 0) : max(col + reach + 1, 0)]
-        highest = float(near[:, :, yaws].max(initial=scores.min()))
-        return (float(scores.max()) - highest) / self._temperature
+            scores = vote.scores(scan) / np.float32(self._temperature)
+            centres = self._best_places(scores, self.settings.contrast_places)
+            about = _near(pose, vote.grid, vote.bins)
+            if all(len(axis) for axis in about):
+                row, col, turn = np.unravel_index(np.argmax(scores[np.ix_(*about)]), [len(axis) for axis in about])
+                centres = np.concatenate([centres, [[about[0][row], about[1][col], about[2][turn]]]])
+            xy = vote.grid.xy_from_pixel(centres[:, :2] + 0.5)
+            places = np.concatenate([np.column_stack([xy, centres[:, 2] * (se2.TWO_PI / vote.bins)]), pose[None]])
+            cut, fine = self._closely(scan, np.unique(self._cells_of(places), axis=0))
+        highest = fine.max(axis=(1, 2, 3))
+        about = _near(pose, lattice.coarse, self._yaw_bins // lattice.turn)
+        is_near = np.all([np.isin(cut[:, axis], about[axis]) for axis in range(3)], axis=0)
+        return float(highest.max() - highest.max(where=is_near, initial=fine.min()))
 
     def _coarse_scores(self, scan: Tensor) -> Float32Array:
         """(rows, cols, K) on the coarse cells."""
@@ -192,8 +202,8 @@ class MapSearch:
             result += self._prior.mean(axis=(1, 3))[:, :, None]
         return result / np.float32(self._temperature)
 
-    def _best_places(self, coarse: Float32Array) -> IntArray:
-        """Row, column and bin (M, 3) of the highest local maxima."""
+    def _best_places(self, coarse: Float32Array, most: int) -> IntArray:
+        """Row, column and bin (M, 3) of the highest local maxima, so many at most."""
         scores = torch.from_numpy(coarse).permute(2, 0, 1)[None]
         around = torch.cat([scores[:, -1:], scores, scores[:, :1]], dim=1)[None]
         highest = functional.max_pool3d(around, 3, stride=1, padding=(0, 1, 1))[0, 0]
@@ -201,7 +211,7 @@ class MapSearch:
         best = float(flat.max())
         peaks = torch.nonzero((flat == highest) & (flat >= best - self.settings.range_nats))
         values = flat[tuple(peaks.T)]
-        chosen = peaks[torch.argsort(values, descending=True, stable=True)[: self.settings.places]]
+        chosen = peaks[torch.argsort(values, descending=True, stable=True)[:most]]
         return chosen[:, [1, 2, 0]].numpy().astype(np.int64)
 
     def _cells_of(self, poses: FloatArray) -> IntArray:
@@ -270,6 +280,18 @@ class _TurnedTemplates:
             turned = rotate_templates(self._scan, torch.tensor([base * self._step], dtype=torch.float64))[0]
             self._known[base] = template_spectrum(turned, self.side)
         return self._known[base], self._scan.shape[-1], turns
+
+
+def _near(pose: FloatArray, grid: MapGrid, bins: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Rows, columns and yaw bins of the cells of a grid within some 10 m and 10 degrees of a pose (3,)."""
+    reach, half_turn = round(_NEAR_M / grid.metres_per_pixel), round(_NEAR_RAD * bins / se2.TWO_PI)
+    row, col = (math.floor(at) for at in grid.pixel_from_xy(pose[:2]))
+    turn = round(float(pose[2]) * bins / se2.TWO_PI)
+    return (
+        np.arange(max(row - reach, 0), min(row + reach + 1, grid.rows)),
+        np.arange(max(col - reach, 0), min(col + reach + 1, grid.cols)),
+        np.arange(turn - half_turn, turn + half_turn + 1) % bins,
+    )
 
 
 def _log_mean(values: Float32Array) -> Float32Array:
