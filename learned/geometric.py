@@ -18,8 +18,9 @@ from torch import Tensor
 from fusion.errors import SkyfixError
 from fusion.likelihood import LikelihoodVolume
 from learned.bev import BODY, GROUND, HIGH, BevSettings, bev_counts
+from learned.map_lattice import MapLattice, MapSearchSettings
 from learned.map_raster import CLASS_INDEX, MapRaster
-from learned.map_search import MapLattice, MapSearch, MapSearchSettings
+from learned.map_search import MapSearch
 from learned.matcher import SearchRegion, matching_window
 from learned.voting import bin_yaws, volume_from_scores, vote, yaw_bins_within
 from learned.whole_map import VotedMapSearch, WholeMapSearch

@@ -11,7 +11,6 @@ two steps: Olson, "Real-time correlative scan matching", ICRA 2009, section V (m
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -23,100 +22,12 @@ from fusion.arrays import Float32Array, FloatArray, IntArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from fusion.two_level import TwoLevelLikelihood
-from learned.coarse_vote import CoarseVote, padded_size
+from learned.coarse_vote import CoarseVote
 from learned.correlation import MapCorrelator, fast_length, template_spectrum
+from learned.map_lattice import MapLattice, MapSearchSettings, bins_together, odd_near
 from learned.voting import prior_scores, rotate_templates
 
 _NEAR_M, _NEAR_RAD = 10.0, math.radians(10.0)
-MOST_CELLS = 100_000_000
-"""Of the coarse level: 400 MB."""
-
-
-@dataclass(frozen=True, slots=True)
-class MapSearchSettings:
-    """How finely.
-
-    Attributes
-    ----------
-    cell_m, heading_deg
-        Wanted size of a coarse cell; an odd number of the vote's cells is taken.
-    places
-        At most so many of the best coarse cells are looked at closely, with their neighbours on all sides.
-    range_nats
-        Cells this far below the best are not looked at closely.
-    contrast_cell_m, contrast_heading_deg
-        Wanted size of a cell where only the contrast is asked for: coarser, as it is asked for often.
-    """
-
-    cell_m: float = 3.0
-    heading_deg: float = 5.0
-    places: int = 16
-    range_nats: float = 12.0
-    contrast_cell_m: float = 5.0
-    contrast_heading_deg: float = 9.0
-
-    def __post_init__(self) -> None:
-        if not all(getattr(self, entry.name) > 0 for entry in fields(self)):
-            raise SkyfixError(f"map search: expected positive settings, got {self}")
-
-
-@dataclass(frozen=True, slots=True)
-class MapLattice:
-    """Where the cells of a whole-map search lie, and the window of map features that it needs.
-
-    Attributes
-    ----------
-    coarse
-        The coarse cells; they cover the map.
-    window
-        Of the features, `feature_m` a cell.
-    side, turn
-        The vote's cells and yaw bins in a coarse one, both odd.
-    template, padded
-        Cells of the scan's features on a side; made a multiple of 2 `side`.
-    """
-
-    coarse: MapGrid
-    window: MapGrid
-    side: int
-    turn: int
-    template: int
-    padded: int
-
-    @classmethod
-    def over(
-        cls,
-        grid: MapGrid,
-        feature_m: float,
-        template: int,
-        yaw_bins: int,
-        multiple_of: int,
-        settings: MapSearchSettings,
-    ) -> MapLattice:
-        """Lay cells over the map `grid`; the window's sides are multiples of so many features."""
-        side = _odd(settings.cell_m / feature_m)
-        turn = _bins_together(yaw_bins, settings.heading_deg)
-        padded = padded_size(template, side)
-        if grid.area_m2 * yaw_bins / turn > MOST_CELLS * (side * feature_m) ** 2:
-            expected = f"at most {MOST_CELLS * (side * feature_m) ** 2 * turn / yaw_bins * 1e-6:.0f} km^2"
-            raise SkyfixError(f"whole-map search: expected a map of {expected}, got {grid.area_m2 * 1e-6:.0f} km^2")
-        cell = side * feature_m
-        rows, cols = (math.ceil(extent / cell) + 1 for extent in (grid.height_m, grid.width_m))
-        height, width = (multiple_of * math.ceil((padded + side * (count + 1)) / multiple_of) for count in (rows, cols))
-        # The first coarse cell that is used is the second: its neighbours' fine cells lie in the window as well.
-        inset = (padded / 2 + side / 2) * feature_m
-        x0 = grid.x0 - inset - 0.5 * (cols * cell - grid.width_m)
-        top = grid.y0 + grid.height_m + inset + 0.5 * (rows * cell - grid.height_m)
-        x0 = grid.x0 + round((x0 - grid.x0) / grid.metres_per_pixel) * grid.metres_per_pixel
-        top = grid.y0 + round((top - grid.y0) / grid.metres_per_pixel) * grid.metres_per_pixel
-        window = MapGrid(height, width, feature_m, x0, top - height * feature_m)
-        coarse = MapGrid(rows, cols, cell, x0 + inset, top - inset - rows * cell)
-        return cls(coarse, window, side, turn, template, padded)
-
-    @property
-    def first(self) -> int:
-        """Where the template of the first fine cell begins in the window, along rows and columns alike."""
-        return self.side + (self.padded - self.template) // 2 - self.side // 2
 
 
 class MapSearch:
@@ -151,8 +62,8 @@ class MapSearch:
         self._features, self.lattice, self.settings = features, lattice, settings
         self._yaw_bins, self._temperature = yaw_bins, temperature
         self._coarse = CoarseVote(features, lattice.window, lattice.template, lattice.side, yaw_bins // lattice.turn)
-        side = _odd(settings.contrast_cell_m / lattice.window.metres_per_pixel)
-        bins = yaw_bins // _bins_together(yaw_bins, settings.contrast_heading_deg)
+        side = odd_near(settings.contrast_cell_m / lattice.window.metres_per_pixel)
+        bins = yaw_bins // bins_together(yaw_bins, settings.contrast_heading_deg)
         self._contrast = CoarseVote(features, lattice.window, lattice.template, side, bins)
         self._prior = None if prior is None else self._prior_of_cells(prior)
 
@@ -163,7 +74,7 @@ class MapSearch:
             raise SkyfixError(f"scan features: expected {expected}, got {tuple(scan.shape)}")
         with torch.inference_mode():
             coarse = self._coarse_scores(scan)
-            centres = self._best_places(coarse)
+            centres = self._best_places(coarse, self.settings.places)
             if near is not None and len(near):
                 centres = np.unique(np.concatenate([centres, self._cells_of(near)]), axis=0)
             cut, fine = self._closely(scan, centres)
@@ -172,17 +83,25 @@ class MapSearch:
         return TwoLevelLikelihood.from_scores(lifted, self.lattice.coarse, cut, fine)
 
     def contrast(self, scan: Tensor, pose: FloatArray) -> float:
-        """Highest coarse score on the map less the highest near a pose (3,): within some 10 m and 10 degrees."""
+        """Highest score on the map less the highest near a pose (3,): within some 10 m and 10 degrees.
+
+        Coarse scores say where to look closely: at the best few places of the map, and at the best one near the pose.
+        """
+        lattice, vote = self.lattice, self._contrast
         with torch.inference_mode():
-            scores = self._contrast.scores(scan)
-        grid, bins = self._contrast.grid, self._contrast.bins
-        reach, half_turn = round(_NEAR_M / grid.metres_per_pixel), round(_NEAR_RAD * bins / se2.TWO_PI)
-        row, col = (math.floor(at) for at in grid.pixel_from_xy(pose[:2]))
-        turn = round(float(pose[2]) * bins / se2.TWO_PI)
-        yaws = np.arange(turn - half_turn, turn + half_turn + 1) % bins
-        near = scores[max(row - reach, 0) : max(row + reach + 1, 0), max(col - reach, 0) : max(col + reach + 1, 0)]
-        highest = float(near[:, :, yaws].max(initial=scores.min()))
-        return (float(scores.max()) - highest) / self._temperature
+            scores = vote.scores(scan) / np.float32(self._temperature)
+            centres = self._best_places(scores, self.settings.contrast_places)
+            about = _near(pose, vote.grid, vote.bins)
+            if all(len(axis) for axis in about):
+                row, col, turn = np.unravel_index(np.argmax(scores[np.ix_(*about)]), [len(axis) for axis in about])
+                centres = np.concatenate([centres, [[about[0][row], about[1][col], about[2][turn]]]])
+            xy = vote.grid.xy_from_pixel(centres[:, :2] + 0.5)
+            places = np.concatenate([np.column_stack([xy, centres[:, 2] * (se2.TWO_PI / vote.bins)]), pose[None]])
+            cut, fine = self._closely(scan, np.unique(self._cells_of(places), axis=0))
+        highest = fine.max(axis=(1, 2, 3))
+        about = _near(pose, lattice.coarse, self._yaw_bins // lattice.turn)
+        is_near = np.all([np.isin(cut[:, axis], about[axis]) for axis in range(3)], axis=0)
+        return float(highest.max() - highest.max(where=is_near, initial=fine.min()))
 
     def _coarse_scores(self, scan: Tensor) -> Float32Array:
         """(rows, cols, K) on the coarse cells."""
@@ -192,8 +111,8 @@ class MapSearch:
             result += self._prior.mean(axis=(1, 3))[:, :, None]
         return result / np.float32(self._temperature)
 
-    def _best_places(self, coarse: Float32Array) -> IntArray:
-        """Row, column and bin (M, 3) of the highest local maxima."""
+    def _best_places(self, coarse: Float32Array, most: int) -> IntArray:
+        """Row, column and bin (M, 3) of the highest local maxima, so many at most."""
         scores = torch.from_numpy(coarse).permute(2, 0, 1)[None]
         around = torch.cat([scores[:, -1:], scores, scores[:, :1]], dim=1)[None]
         highest = functional.max_pool3d(around, 3, stride=1, padding=(0, 1, 1))[0, 0]
@@ -201,7 +120,7 @@ class MapSearch:
         best = float(flat.max())
         peaks = torch.nonzero((flat == highest) & (flat >= best - self.settings.range_nats))
         values = flat[tuple(peaks.T)]
-        chosen = peaks[torch.argsort(values, descending=True, stable=True)[: self.settings.places]]
+        chosen = peaks[torch.argsort(values, descending=True, stable=True)[:most]]
         return chosen[:, [1, 2, 0]].numpy().astype(np.int64)
 
     def _cells_of(self, poses: FloatArray) -> IntArray:
@@ -272,19 +191,20 @@ class _TurnedTemplates:
         return self._known[base], self._scan.shape[-1], turns
 
 
+def _near(pose: FloatArray, grid: MapGrid, bins: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Rows, columns and yaw bins of the cells of a grid within some 10 m and 10 degrees of a pose (3,)."""
+    reach, half_turn = round(_NEAR_M / grid.metres_per_pixel), round(_NEAR_RAD * bins / se2.TWO_PI)
+    row, col = (math.floor(at) for at in grid.pixel_from_xy(pose[:2]))
+    turn = round(float(pose[2]) * bins / se2.TWO_PI)
+    return (
+        np.arange(max(row - reach, 0), min(row + reach + 1, grid.rows)),
+        np.arange(max(col - reach, 0), min(col + reach + 1, grid.cols)),
+        np.arange(turn - half_turn, turn + half_turn + 1) % bins,
+    )
+
+
 def _log_mean(values: Float32Array) -> Float32Array:
     """ln of the mean exponential of each cell's (M, side, side, turn)."""
     peak = values.max(axis=(1, 2, 3))
     mean = np.exp(values - peak[:, None, None, None]).mean(axis=(1, 2, 3), dtype=np.float64)
     return np.asarray(peak + np.log(mean), np.float32)
-
-
-def _odd(number: float) -> int:
-    """The odd number nearest to a positive one."""
-    return max(2 * math.floor(number / 2) + 1, 1)
-
-
-def _bins_together(yaw_bins: int, heading_deg: float) -> int:
-    """The odd divisor of a number of yaw bins that makes coarse bins nearest to so many degrees."""
-    odd = [number for number in range(1, yaw_bins + 1, 2) if yaw_bins % number == 0]
-    return min(odd, key=lambda number: abs(math.log(number * 360.0 / yaw_bins / heading_deg)))

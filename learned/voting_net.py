@@ -23,8 +23,9 @@ from fusion.likelihood import LikelihoodVolume
 from learned.bev import BANDS_M, BevSettings, bev_counts, log_density
 from learned.calibration import Calibration
 from learned.losses import HeadingQuadrature, scores_nll
+from learned.map_lattice import MapLattice, MapSearchSettings
 from learned.map_raster import MapRaster
-from learned.map_search import MapLattice, MapSearch, MapSearchSettings
+from learned.map_search import MapSearch
 from learned.matcher import SearchRegion, matching_window
 from learned.network import Batch, NetworkSettings, picture_tensor
 from learned.voting import bin_yaws, prior_scores, volume_from_scores, vote, yaw_bins_within

@@ -227,9 +227,10 @@ class FilterPass:
     ) -> None:
         """Weigh all places on the map; track the one that wins."""
         particles = self._anywhere.update(particles, likelihood, temperature, accumulate(self._since_measured))
-        if self._plan.record_places(self._anywhere.share(particles)):
+        share = self._anywhere.share(particles)
+        if self._plan.record_places(share):
             particles = self._anywhere.settle(particles)
-            self._watch.restart(self._travelled_m)
+            self._watch.restart(self._travelled_m, 1.0 - share)
             x, y, _ = particles.estimate(self._stamp(frame)).pose
             self._note(frame, f"found at ({x:.1f}, {y:.1f})")
         self._filter = particles

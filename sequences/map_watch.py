@@ -1,13 +1,13 @@
 """Is the vehicle still where the filter has it? Asked of the whole map now and then.
 
 A likelihood over a narrow search cannot tell: on a straight road the next straight road fits as well, and normalised
-over the search alone both are certain. So at times the scan is scored, coarsely, against all of the map. The contrast
+over the search alone both are certain. So at times the scan is scored against all of the map. The contrast
 
     r = max over the map of ln L  -  max near the filter's pose of ln L
 
-is nothing or a few nats for a vehicle on track, since the best of millions of wrong poses beats the right one by chance
-at times, and much for one that is elsewhere. It enters a hidden Markov model of two states, `fusion.particles.lost`,
-with what chance alone can do taken off, and bounded: no scan decides alone.
+is mostly nothing and at times a few nats for a vehicle on track, since the best of millions of wrong poses beats the
+right one by chance, and much for one that is elsewhere. It enters a hidden Markov model of two states,
+`fusion.particles.lost`, with what chance alone can do taken off, and bounded: no scan decides alone.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from __future__ import annotations
 from fusion.particles.lost import LostModel, probability
 
 _BY_CHANCE_NATS = 3.0
-_MOST_NATS = 3.0  # that one scan can speak for being elsewhere: its errors may be gross
+_MOST_NATS = 4.0  # that one scan can speak for being elsewhere: its errors may be gross
 _SUSPICION = 0.01
 _LEAST_AREA_M2 = 1e6
 
@@ -49,6 +49,6 @@ class MapWatch:
         self.lost = probability(self._model.log_odds(self.lost, 0.0, min(contrast_nats - _BY_CHANCE_NATS, _MOST_NATS)))
         return self.lost
 
-    def restart(self, way_m: float) -> None:
-        """Begin anew: the vehicle has just been looked for on the whole map."""
-        self._asked_at_m, self.lost = way_m, self._model.kidnap_probability
+    def restart(self, way_m: float, lost: float) -> None:
+        """Begin anew: the vehicle has been looked for on the whole map, and is elsewhere with this probability."""
+        self._asked_at_m, self.lost = way_m, max(lost, self._model.kidnap_probability)

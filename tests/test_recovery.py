@@ -231,8 +231,11 @@ def test_the_watch_needs_more_than_one_scan_that_fits_elsewhere_a_little() -> No
     watch.record(412.0, 8.0)
     watch.record(416.0, 8.0)
     assert watch.record(420.0, 8.0) > 0.8
-    watch.restart(424.0)
+    watch.restart(424.0, 0.0)
     assert watch.lost < 0.01
+    assert not watch.is_due(427.9)
+    watch.restart(424.0, 0.1)
+    assert watch.is_due(424.5)  # a place found with one chance in ten of another is looked at again at once
     assert not MapWatch(0.0, 1e5).is_due(1e6)
     assert not MapWatch(4.0, 5e6).is_due(19.0)
 

@@ -15,8 +15,9 @@ from fusion.likelihood import LikelihoodVolume
 from fusion.two_level import TwoLevelLikelihood
 from learned.bev import BevSettings
 from learned.hybrid import HybridNet, HybridSettings
+from learned.map_lattice import MapLattice, MapSearchSettings
 from learned.map_raster import CLASS_INDEX, MapRaster
-from learned.map_search import MapLattice, MapSearch, MapSearchSettings
+from learned.map_search import MapSearch
 from learned.rotmatch import RotMatch, RotMatchNet, RotMatchSettings
 from learned.voting import bin_yaws, rotate_templates, vote
 from learned.voting_net import VotingMatcher
@@ -103,6 +104,20 @@ def test_the_contrast_is_nothing_at_the_right_place_and_much_elsewhere(lattice: 
         assert search.contrast(scan, pose) == 0.0
         assert search.contrast(scan, pose + [-22.0, 4.0, 0.0]) > 5.0
         assert search.contrast(scan, pose + [1e4, 0.0, 0.0]) > 5.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_contrast_is_that_of_the_ordinary_vote_over_the_whole_map(lattice: MapLattice, seed: int) -> None:
+    found, scan, pose = scene(lattice, seed)
+    search, everywhere = MapSearch(found, lattice, YAW_BINS, 1.0, CLOSE), narrow(found, scan, lattice)
+    elsewhere = pose + [-22.0, 4.0, 1.0]
+    x, y = everywhere.grid.centres()
+    yaw = np.arange(YAW_BINS) * 2 * np.pi / YAW_BINS
+    about = (np.abs(x - elsewhere[0]) < 12.0)[None, :, None] & (np.abs(y - elsewhere[1]) < 12.0)[:, None, None]
+    about = about & (np.abs(np.angle(np.exp(1j * (yaw - elsewhere[2])))) < np.deg2rad(28.0))
+    expected = everywhere.log_prob.max() - everywhere.log_prob.max(where=about, initial=-np.inf)
+    # Only a few places are looked at closely: what is best near the pose may be missed, never overstated.
+    assert expected - 2e-3 <= search.contrast(scan, elsewhere) < 1.3 * expected + 1.0
 
 
 def test_a_prior_of_the_map_counts_as_in_the_ordinary_vote(lattice: MapLattice) -> None:
