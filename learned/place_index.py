@@ -2,13 +2,14 @@
 
 The map is cut into tiles, and every few metres along its roads into places. The index holds an embedding of each place
 (`learned.place_embedding`) and the map's features, coarsely. A lookup takes two steps: all places are compared by
-their embeddings, and the best of them once more by the vote of the scan's features about each
-(`learned.place_vote`). A tile is worth what its best place is.
+their embeddings, and the best of them once more by the vote of the scan's features about each (`learned.place_vote`),
+less its mean over the headings: what a place gets whatever the heading is its own, more in a dense town than in a thin
+one, and says nothing of the scan. A tile is worth what its best place is.
 
-The comparison of embeddings is a product over all places and orders, then a Fourier sum over headings. It is exact,
-and linear in the length of the map's roads, at some microseconds a place; the vote costs the same however large the
-map. A nearest-neighbour graph (usearch, faiss) takes one vector a heading, 72 lookups a scan for an approximate
-answer, and holds no more places in memory; it would earn its place from some hundred thousand places on.
+The comparison of embeddings is a product over all places and orders, then a Fourier sum over headings: exact, linear in
+the length of the map's roads, and far below the cost of the vote, which is the same however large the map. So no
+nearest-neighbour graph (usearch, faiss): it takes one vector a heading, 72 lookups a scan for an approximate answer,
+and would save what is hardly spent.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ class PlaceIndex:
             raise SkyfixError(f"scan embedding: expected {expected}, got {tuple(embedding.shape)}")
         return np.asarray(similarities(embedding, self.embeddings, HEADINGS).numpy(), np.float32)
 
-    def query(self, embedding: Tensor, scan: Tensor, k: int = 10, shortlist: int = 200) -> Retrieved:
+    def query(self, embedding: Tensor, scan: Tensor, k: int = 10, shortlist: int = 400) -> Retrieved:
         """The `k` best tiles for a scan, fewer where the map has fewer.
 
         Parameters
@@ -131,6 +132,7 @@ class PlaceIndex:
         likest = np.argsort(-alike, kind="stable")[:shortlist]
         per_cell = round(self.grid.metres_per_pixel / self.feature_m)
         votes = vote_at(self.features, scan, self.cells[likest] * per_cell, per_cell, HEADINGS) / self.temperature
+        votes -= votes.mean(axis=1, keepdims=True)
         # Whoever was not voted on lies below all who were, in the order of the embeddings: cosines differ by 2 at most.
         scores = cosines - np.float32(2.0) + votes.max(axis=1).min()
         scores[likest] = votes

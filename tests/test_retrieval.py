@@ -212,7 +212,7 @@ def test_a_filter_starts_from_an_answer(index: PlaceIndex) -> None:
 
 
 def test_the_shipped_embedding_finds_tiles_of_a_simulated_town() -> None:
-    """8 scans of a town that nobody trained on, some 40 tiles: 4 of 8 among the first 3 by chance is rarer than 1 %."""
+    """8 scans of a town that nobody trained on, 25 tiles at least: 4 of 8 among the first 3 by chance has 1 %."""
     grid = MapGrid(720, 720, 0.5, 0.0, 0.0)
     rng = np.random.default_rng(5)
     classes = np.full((720, 720), CLASS_INDEX["grass"], np.uint8)
@@ -224,7 +224,7 @@ def test_the_shipped_embedding_finds_tiles_of_a_simulated_town() -> None:
         classes[street - 7 : street + 7] = CLASS_INDEX["road"]
         classes[:, street - 17 : street - 3] = CLASS_INDEX["road"]
     raster = MapRaster.from_classes(grid, classes)
-    world, model = world_from_raster(raster, 3), LidarModel(azimuths=900)
+    world, model = world_from_raster(raster, 3), LidarModel(azimuths=600)
     retriever = Retriever(RotMatch.shipped())
     index = retriever.build(raster)
     assert 25 <= index.tiles <= 36
@@ -233,7 +233,7 @@ def test_the_shipped_embedding_finds_tiles_of_a_simulated_town() -> None:
         along, street = rng.uniform(80.0, 280.0), 360.0 - streets[number % 5] * 0.5
         pose = np.array([along, street - 1.5, 0.0 if number % 2 else math.pi])
         points = simulate_scan(world, pose, model, np.random.default_rng(number))
-        found = retriever.query(index, points, -model.mount_height_m, 3)
+        found = retriever.query(index, points, -model.mount_height_m, 3, shortlist=64)
         right += bool((np.abs(found.centres - pose[:2]) <= 32.0).all(axis=1).any())
     assert right >= 4
 
