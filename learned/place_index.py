@@ -1,10 +1,11 @@
 """An index of the places of one map: what each looks like, to be compared with a scan at all headings at once.
 
 The map is cut into tiles, and every few metres along its roads into places. The index holds an embedding of each place
-(`learned.place_embedding`) and the map's features, coarsely. A lookup takes two steps: all places are compared by
-their embeddings, and the best of them once more by the vote of the scan's features about each (`learned.place_vote`),
-less its mean over the headings: what a place gets whatever the heading is its own, more in a dense town than in a thin
-one, and says nothing of the scan. A tile is worth what its best place is.
+(`learned.place_embedding`) and the map's features, coarsely. A lookup takes three steps: all places are compared by
+their embeddings; the likest are weighed by the vote of the scan's features about each (`learned.place_vote`), less its
+mean over the headings, since what a place gets whatever the heading is its own, more in a dense town than in a thin
+one, and says nothing of the scan; and the best of these by the whole vote at finer headings. The embedding's score is
+added to both. A tile is worth what its best place is.
 
 The comparison of embeddings is a product over all places and orders, then a Fourier sum over headings: exact, linear in
 the length of the map's roads, and far below the cost of the vote, which is the same however large the map. So no
@@ -32,6 +33,10 @@ from learned.place_vote import vote_at
 
 HEADINGS = 72
 """5 degrees apart: order 16 turns once in 22.5 degrees, and 10 would step over its peaks."""
+_NATS = np.float32(20.0)
+"""What a cosine of 1 is worth over one of 0: where the training of embeddings starts from."""
+_CLOSELY, _FINER = 96, 3
+"""So many places are voted on at so many headings a bin."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,7 +115,7 @@ class PlaceIndex:
             raise SkyfixError(f"scan embedding: expected {expected}, got {tuple(embedding.shape)}")
         return np.asarray(similarities(embedding, self.embeddings, HEADINGS).numpy(), np.float32)
 
-    def query(self, embedding: Tensor, scan: Tensor, k: int = 10, shortlist: int = 400) -> Retrieved:
+    def query(self, embedding: Tensor, scan: Tensor, k: int = 10, shortlist: int = 1000) -> Retrieved:
         """The `k` best tiles for a scan, fewer where the map has fewer.
 
         Parameters
@@ -118,7 +123,7 @@ class PlaceIndex:
         embedding, scan
             (M + 1, D) of the scan; (C, n, n) its features on the vote's cells.
         shortlist
-            Places whose embeddings are the likest are voted on; the others count as no better than the worst of these.
+            So many places whose embeddings are the likest are voted on; no other counts as better than the worst.
 
         Raises
         ------
@@ -128,14 +133,13 @@ class PlaceIndex:
         if k < 1 or shortlist < 1:
             raise SkyfixError(f"retrieval: expected k and shortlist of 1 or more, got {k} and {shortlist}")
         cosines = self.similarities(embedding)
-        alike = cosines.max(axis=1)
-        likest = np.argsort(-alike, kind="stable")[:shortlist]
-        per_cell = round(self.grid.metres_per_pixel / self.feature_m)
-        votes = vote_at(self.features, scan, self.cells[likest] * per_cell, per_cell, HEADINGS) / self.temperature
-        votes -= votes.mean(axis=1, keepdims=True)
-        # Whoever was not voted on lies below all who were, in the order of the embeddings: cosines differ by 2 at most.
-        scores = cosines - np.float32(2.0) + votes.max(axis=1).min()
-        scores[likest] = votes
+        alike = _NATS * cosines.max(axis=1, keepdims=True)
+        likest = np.argsort(-alike[:, 0], kind="stable")[:shortlist]
+        votes = self._votes(scan, likest, 1)
+        votes += alike[likest] - votes.mean(axis=1, keepdims=True)
+        scores = _with_better(_NATS * cosines, likest, votes)
+        closest = likest[np.argsort(-votes.max(axis=1), kind="stable")[:_CLOSELY]]
+        scores = _with_better(scores, closest, self._votes(scan, closest, _FINER) + alike[closest])
         best = scores.max(axis=1)
         tiles = self.cells // self.tile_cells
         order = np.argsort(-best, kind="stable")
@@ -146,8 +150,19 @@ class PlaceIndex:
         centres = self.grid.xy_from_pixel((tiles[chosen] + 0.5) * self.tile_cells)
         return Retrieved(centres, np.column_stack([xy, yaw]), best[chosen].astype(np.float64), scores)
 
+    def _votes(self, scan: Tensor, places: IntArray, finer: int) -> Float32Array:
+        """Best votes (P, HEADINGS) at places (P,), nats; of so many headings in each bin, an odd number."""
+        per_cell = round(self.grid.metres_per_pixel / self.feature_m)
+        votes = vote_at(self.features, scan, self.cells[places] * per_cell, per_cell, finer * HEADINGS)
+        binned = np.roll(votes, finer // 2, axis=1).reshape(len(places), HEADINGS, finer)
+        return np.asarray(binned.max(axis=2) / self.temperature, np.float32)
+
     def likelihood(self, found: Retrieved) -> LikelihoodVolume:
-        """What an answer of this index says about the pose: a density over the places, to draw particles from."""
+        """What an answer of this index says about the pose: a density over the places, to draw particles from.
+
+        It is sharper than an answer is right, for vote and embedding are of one scan: weigh what is drawn from it by a
+        matcher's likelihood, as `sequences.start_cloud` does with what it draws.
+        """
         plan = (self.grid.rows, self.grid.cols)
         scores = np.zeros((*plan, found.place_scores.shape[1]), np.float32)
         scores[tuple(self.cells.T)] = found.place_scores
@@ -208,3 +223,13 @@ class PlaceIndex:
         except (OSError, KeyError, ValueError, RuntimeError, AttributeError, zipfile.BadZipFile) as error:
             what = str(error).splitlines()[0]
             raise SkyfixError(f"index {path.name}: expected a file that PlaceIndex.save wrote, got: {what}") from error
+
+
+def _with_better(scores: Float32Array, chosen: IntArray, better: Float32Array) -> Float32Array:
+    """Scores (N, headings) with those of some places (P,) replaced; the others' best is then the worst of these."""
+    others = np.ones(len(scores), np.bool_)
+    others[chosen] = False
+    highest = scores[others].max() if others.any() else np.float32(0.0)
+    result = scores + (better.max(axis=1).min() - highest)
+    result[chosen] = better
+    return result

@@ -124,7 +124,7 @@ class Retriever:
         )
 
     def query(
-        self, index: PlaceIndex, points: NDArray[np.float32], ground_z: float, k: int = 10, shortlist: int = 400
+        self, index: PlaceIndex, points: NDArray[np.float32], ground_z: float, k: int = 10, shortlist: int = 1000
     ) -> Retrieved:
         """The `k` best tiles for a scan (N, 4) whose ground under the vehicle is at `ground_z`, metres.
 

@@ -19,7 +19,7 @@ def retrieve(
     ] = None,
     shortlist: Annotated[
         int, typer.Option(help="Places that are looked at again with the network's vote.", metavar="N")
-    ] = 400,
+    ] = 1000,
     max_frames: MaxFramesOption = 200,
     seed: SeedOption = 0,
     json_file: JsonOption = None,

@@ -86,7 +86,7 @@ def index_of(sequence: Sequence, retriever: Retriever, path: Path | None) -> Pla
 
 
 def score_retrieval(
-    sequence: Sequence, retriever: Retriever, index: PlaceIndex, max_frames: int = 200, shortlist: int = 400
+    sequence: Sequence, retriever: Retriever, index: PlaceIndex, max_frames: int = 200, shortlist: int = 1000
 ) -> dict[str, Any]:
     """Recall of the tile that holds the true position, and seconds a scan.
 

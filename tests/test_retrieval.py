@@ -212,7 +212,7 @@ def test_a_filter_starts_from_an_answer(index: PlaceIndex) -> None:
 
 
 def test_the_shipped_embedding_finds_tiles_of_a_simulated_town() -> None:
-    """8 scans of a town that nobody trained on, 25 tiles at least: 4 of 8 among the first 3 by chance has 1 %."""
+    """8 scans of a town that nobody trained on, 25 tiles at least: 5 of 8 among the first 3 by chance has 0.1 %."""
     grid = MapGrid(720, 720, 0.5, 0.0, 0.0)
     rng = np.random.default_rng(5)
     classes = np.full((720, 720), CLASS_INDEX["grass"], np.uint8)
@@ -235,7 +235,7 @@ def test_the_shipped_embedding_finds_tiles_of_a_simulated_town() -> None:
         points = simulate_scan(world, pose, model, np.random.default_rng(number))
         found = retriever.query(index, points, -model.mount_height_m, 3, shortlist=64)
         right += bool((np.abs(found.centres - pose[:2]) <= 32.0).all(axis=1).any())
-    assert right >= 4
+    assert right >= 5
 
 
 @pytest.mark.parametrize(("k", "shortlist"), [(0, 72), (3, 0)])
