@@ -17,6 +17,7 @@ from fusion.errors import SkyfixError
 from sequences.cli_ablate import ablate
 from sequences.cli_evaluate import evaluate
 from sequences.cli_options import JsonOption, PickleOption, SeedOption, write_json
+from sequences.cli_retrieve import retrieve
 from sequences.cli_track import demo, track, view
 from sequences.cli_train import export, train
 
@@ -60,6 +61,7 @@ app.command(
     "`skyfix export rotmatch --out exported`\n\n"
     "`skyfix export runs/training/rotmatch.safetensors --out exported --int8 drives/kitti_13`"
 )(export)
+app.command(epilog="Example: `skyfix retrieve drives/kitti_360 --index maps/karlsruhe.npz`")(retrieve)
 
 
 @app.command(epilog="Example: `skyfix convert KITTI/raw_data/2011_09_26/2011_09_26_drive_0013_sync drives/kitti_13`")

@@ -1,0 +1,235 @@
+"""An index of the places of one map: what each looks like, to be compared with a scan at all headings at once.
+
+The map is cut into tiles, and every few metres along its roads into places. The index holds an embedding of each place
+(`learned.place_embedding`) and the map's features, coarsely. A lookup takes three steps: all places are compared by
+their embeddings; the likest are weighed by the vote of the scan's features about each (`learned.place_vote`), less its
+mean over the headings, since what a place gets whatever the heading is its own, more in a dense town than in a thin
+one, and says nothing of the scan; and the best of these by the whole vote at finer headings. The embedding's score is
+added to both. A tile is worth what its best place is.
+
+The comparison of embeddings is a product over all places and orders, then a Fourier sum over headings: exact, linear in
+the length of the map's roads, and far below the cost of the vote, which is the same however large the map. So no
+nearest-neighbour graph (usearch, faiss): it takes one vector a heading, 72 lookups a scan for an approximate answer,
+and would save what is hardly spent.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fusion import se2
+from fusion.arrays import Float32Array, FloatArray, IntArray
+from fusion.errors import SkyfixError
+from fusion.grid import MapGrid
+from fusion.likelihood import LikelihoodVolume
+from learned.place_embedding import similarities
+from learned.place_vote import vote_at
+
+HEADINGS = 72
+"""5 degrees apart: order 16 turns once in 22.5 degrees, and 10 would step over its peaks."""
+_NATS = np.float32(20.0)
+"""What a cosine of 1 is worth over one of 0: where the training of embeddings starts from."""
+_CLOSELY, _FINER = 96, 3
+"""So many places are voted on at so many headings a bin."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Retrieved:
+    """Tiles that a scan may have been taken in, the likeliest first.
+
+    Attributes
+    ----------
+    centres
+        (k, 2) of the tiles, metres in the map frame.
+    poses
+        (k, 3) the best place and heading of each: metres, radians.
+    scores
+        (k,) of the best places, nats.
+    place_scores
+        (N, headings) of all places, nats, in the index's order; yaw of column j is 2 pi j / headings.
+    """
+
+    centres: FloatArray
+    poses: FloatArray
+    scores: FloatArray
+    place_scores: Float32Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceIndex:
+    """Places of one map.
+
+    Attributes
+    ----------
+    grid
+        Square cells over the map; a place is the middle of one.
+    cells
+        (N, 2) row and column of the places.
+    embeddings
+        (N, M + 1, D) complex64.
+    features
+        (C, H, W) float16 of the map, from the grid's upper left corner on.
+    feature_m
+        Side of their cells, metres; it divides that of the grid's cells.
+    tile_cells
+        Cells on a side of a tile; tiles are counted from the map's upper left corner.
+    temperature
+        What votes are divided by to be nats.
+    fingerprint
+        Of the weights of the network that made it.
+    map_digest
+        Of the map.
+    """
+
+    grid: MapGrid
+    cells: IntArray
+    embeddings: Tensor
+    features: Tensor
+    feature_m: float
+    tile_cells: int
+    temperature: float
+    fingerprint: str
+    map_digest: str
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles that hold a place."""
+        return len(np.unique(self.cells // self.tile_cells, axis=0))
+
+    def similarities(self, embedding: Tensor) -> Float32Array:
+        """Cosines (N, HEADINGS) of a scan's embedding (M + 1, D) with all places.
+
+        Raises
+        ------
+        SkyfixError
+            If the embedding is of another size.
+        """
+        if embedding.shape != self.embeddings.shape[1:]:
+            expected = tuple(self.embeddings.shape[1:])
+            raise SkyfixError(f"scan embedding: expected {expected}, got {tuple(embedding.shape)}")
+        return np.asarray(similarities(embedding, self.embeddings, HEADINGS).numpy(), np.float32)
+
+    def query(self, embedding: Tensor, scan: Tensor, k: int = 10, shortlist: int = 1000) -> Retrieved:
+        """The `k` best tiles for a scan, fewer where the map has fewer.
+
+        Parameters
+        ----------
+        embedding, scan
+            (M + 1, D) of the scan; (C, n, n) its features on the vote's cells.
+        shortlist
+            So many places whose embeddings are the likest are voted on; no other counts as better than the worst.
+
+        Raises
+        ------
+        SkyfixError
+            If `k` or `shortlist` is not positive, or the embedding is of another size.
+        """
+        if k < 1 or shortlist < 1:
+            raise SkyfixError(f"retrieval: expected k and shortlist of 1 or more, got {k} and {shortlist}")
+        cosines = self.similarities(embedding)
+        alike = _NATS * cosines.max(axis=1, keepdims=True)
+        likest = np.argsort(-alike[:, 0], kind="stable")[:shortlist]
+        votes = self._votes(scan, likest, 1)
+        votes += alike[likest] - votes.mean(axis=1, keepdims=True)
+        scores = _with_better(_NATS * cosines, likest, votes)
+        closest = likest[np.argsort(-votes.max(axis=1), kind="stable")[:_CLOSELY]]
+        scores = _with_better(scores, closest, self._votes(scan, closest, _FINER) + alike[closest])
+        best = scores.max(axis=1)
+        tiles = self.cells // self.tile_cells
+        order = np.argsort(-best, kind="stable")
+        _, first = np.unique(tiles[order], axis=0, return_index=True)
+        chosen = order[np.sort(first)[:k]]
+        yaw = se2.wrap(scores[chosen].argmax(axis=1) * (se2.TWO_PI / HEADINGS))
+        xy = self.grid.xy_from_pixel(self.cells[chosen] + 0.5)
+        centres = self.grid.xy_from_pixel((tiles[chosen] + 0.5) * self.tile_cells)
+        return Retrieved(centres, np.column_stack([xy, yaw]), best[chosen].astype(np.float64), scores)
+
+    def _votes(self, scan: Tensor, places: IntArray, finer: int) -> Float32Array:
+        """Best votes (P, HEADINGS) at places (P,), nats; of so many headings in each bin, an odd number."""
+        per_cell = round(self.grid.metres_per_pixel / self.feature_m)
+        votes = vote_at(self.features, scan, self.cells[places] * per_cell, per_cell, finer * HEADINGS)
+        binned = np.roll(votes, finer // 2, axis=1).reshape(len(places), HEADINGS, finer)
+        return np.asarray(binned.max(axis=2) / self.temperature, np.float32)
+
+    def likelihood(self, found: Retrieved) -> LikelihoodVolume:
+        """What an answer of this index says about the pose: a density over the places, to draw particles from.
+
+        It is sharper than an answer is right, for vote and embedding are of one scan: weigh what is drawn from it by a
+        matcher's likelihood, as `sequences.start_cloud` does with what it draws.
+        """
+        plan = (self.grid.rows, self.grid.cols)
+        scores = np.zeros((*plan, found.place_scores.shape[1]), np.float32)
+        scores[tuple(self.cells.T)] = found.place_scores
+        valid = np.zeros((*plan, 1), np.bool_)
+        valid[tuple(self.cells.T)] = True
+        return LikelihoodVolume.from_scores(scores, self.grid, valid=valid)
+
+    def save(self, path: Path) -> None:
+        """Write PATH (.npz).
+
+        Raises
+        ------
+        SkyfixError
+            If it cannot be written.
+        """
+        grid = self.grid
+        place = np.array([grid.rows, grid.cols, grid.metres_per_pixel, grid.x0, grid.y0], np.float64)
+        try:
+            with path.open("wb") as file:
+                np.savez(
+                    file,
+                    grid=place,
+                    cells=self.cells,
+                    embeddings=torch.view_as_real(self.embeddings).half().numpy(),
+                    features=self.features.numpy(),
+                    feature_m=self.feature_m,
+                    tile_cells=self.tile_cells,
+                    temperature=self.temperature,
+                    fingerprint=self.fingerprint,
+                    map_digest=self.map_digest,
+                )
+        except OSError as error:
+            raise SkyfixError(f"index {path}: cannot be written: {error.strerror}") from error
+
+    @classmethod
+    def load(cls, path: Path) -> PlaceIndex:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        SkyfixError
+            If the file is missing or something else.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                rows, cols, step, x0, y0 = data["grid"].tolist()
+                return cls(
+                    MapGrid(int(rows), int(cols), step, x0, y0),
+                    data["cells"],
+                    torch.view_as_complex(torch.from_numpy(data["embeddings"].astype(np.float32))),
+                    torch.from_numpy(data["features"]),
+                    float(data["feature_m"]),
+                    int(data["tile_cells"]),
+                    float(data["temperature"]),
+                    str(data["fingerprint"]),
+                    str(data["map_digest"]),
+                )
+        except (OSError, KeyError, ValueError, RuntimeError, AttributeError, zipfile.BadZipFile) as error:
+            what = str(error).splitlines()[0]
+            raise SkyfixError(f"index {path.name}: expected a file that PlaceIndex.save wrote, got: {what}") from error
+
+
+def _with_better(scores: Float32Array, chosen: IntArray, better: Float32Array) -> Float32Array:
+    """Scores (N, headings) with those of some places (P,) replaced; the others' best is then the worst of these."""
+    others = np.ones(len(scores), np.bool_)
+    others[chosen] = False
+    highest = scores[others].max() if others.any() else np.float32(0.0)
+    result = scores + (better.max(axis=1).min() - highest)
+    result[chosen] = better
+    return result

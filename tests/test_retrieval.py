@@ -1,0 +1,269 @@
+"""Retrieval: harmonics turn with the scan, an index finds its own places, files come back, bad input is one line."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from fusion.errors import SkyfixError
+from fusion.grid import MapGrid
+from fusion.particle_filter import ParticleFilter
+from learned.bev import BevSettings
+from learned.map_raster import CLASS_INDEX, MapRaster
+from learned.network import picture_tensor
+from learned.place_embedding import PlaceEmbedding, order_factors, similarities
+from learned.place_index import HEADINGS, PlaceIndex, Retrieved
+from learned.place_vote import vote_at
+from learned.retrieval import Retriever, TileSettings, fingerprint_of, map_features
+from learned.ring_harmonics import RingHarmonics, at_headings
+from learned.rotmatch import RotMatch, RotMatchNet, RotMatchSettings
+from learned.voting import vote
+from sequences.lidar import LidarModel, simulate_scan
+from sequences.world import world_from_raster
+
+RINGS = RingHarmonics((4.0, 8.0, 12.0, 16.0), orders=6, cell_m=2.0, reach_m=20.0)
+TOWN = MapGrid(400, 480, 0.5, -50.0, 20.0)
+
+
+@pytest.fixture(scope="module")
+def matcher() -> RotMatch:
+    torch.manual_seed(0)
+    return RotMatch(RotMatchNet(RotMatchSettings(4, (4, 4, 8, 8), BevSettings(20.0))))
+
+
+def embedding_of(matcher: RotMatch, rings: RingHarmonics = RINGS) -> PlaceEmbedding:
+    """Random projections, the same for scans and maps."""
+    generator = torch.Generator().manual_seed(1)
+    features = 4 * len(rings.rings_m)
+    weights = torch.randn(rings.orders + 1, features, 5, generator=generator, dtype=torch.complex64)
+    zero = torch.zeros(features)
+    return PlaceEmbedding(weights, weights, zero, zero, fingerprint_of(matcher.net), rings)
+
+
+def town() -> MapRaster:
+    """Two roads and blocks of houses at random."""
+    rng = np.random.default_rng(0)
+    classes = np.zeros((TOWN.rows, TOWN.cols), np.uint8)
+    for _ in range(120):
+        row, col = rng.integers(0, TOWN.rows), rng.integers(0, TOWN.cols)
+        classes[row : row + rng.integers(8, 40), col : col + rng.integers(8, 40)] = CLASS_INDEX["building"]
+    classes[190:206], classes[:, 230:246] = CLASS_INDEX["road"], CLASS_INDEX["road"]
+    return MapRaster.from_classes(TOWN, classes)
+
+
+def made_points() -> NDArray[np.float32]:
+    """Returns (4000, 4) all around."""
+    rng = np.random.default_rng(4)
+    points = np.column_stack([rng.uniform(-18, 18, (4000, 2)), rng.uniform(-1.7, 2.0, 4000), np.zeros(4000)])
+    return points.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def index(matcher: RotMatch) -> PlaceIndex:
+    return Retriever(matcher, embedding_of(matcher)).build(town())
+
+
+def test_a_quarter_turn_of_the_image_turns_the_harmonics() -> None:
+    """Order m times exp(-i m a), exactly: a quarter turn moves cells to cells."""
+    image = torch.randn(1, 2, RINGS.size, RINGS.size, generator=torch.Generator().manual_seed(0))
+    basis = RINGS.basis()
+    plain, turned = RINGS.of(image, basis), RINGS.of(torch.rot90(image, 1, dims=(2, 3)), basis)
+    phase = torch.exp(-0.5j * math.pi * torch.arange(RINGS.orders + 1))
+    torch.testing.assert_close(turned, plain * phase, atol=2e-3, rtol=1e-3)
+
+
+def test_scores_peak_at_the_heading() -> None:
+    """The map's image is the scan's, turned to its heading: counter-clockwise."""
+    image = torch.randn(1, 3, RINGS.size, RINGS.size, generator=torch.Generator().manual_seed(3))
+    basis = RINGS.basis()
+    scan, place = RINGS.of(image, basis)[0], RINGS.of(torch.rot90(image, 1, dims=(2, 3)), basis)[0]
+    products = (scan.conj() * place).sum(0) * order_factors(RINGS.orders + 1)
+    assert int(at_headings(products, 72).argmax()) == 18  # 90 degrees
+
+
+def looked_up(index: PlaceIndex, place: int, turn: int, k: int, shortlist: int = 40) -> Retrieved:
+    """A scan that saw just what the map shows at a place, the vehicle turned by `turn` quarters, looked up."""
+    orders = torch.arange(RINGS.orders + 1)
+    embedding = index.embeddings[place] * torch.exp(0.5j * math.pi * turn * orders)[:, None]
+    per_cell = round(index.grid.metres_per_pixel / index.feature_m)
+    row, col = index.cells[place] * per_cell + per_cell // 2
+    padded = torch.nn.functional.pad(index.features.float(), (10, 10, 10, 10))
+    # Turning the vehicle to the left turns what it sees to the right.
+    scan = torch.rot90(padded[:, row : row + 20, col : col + 20], -turn, dims=(1, 2)).contiguous()
+    return index.query(embedding, scan, k, shortlist)
+
+
+def test_a_place_is_found_by_what_it_looks_like_whatever_the_heading(index: PlaceIndex) -> None:
+    """A scan that saw just what the map shows there gets its tile first, and its place and heading right."""
+    rng = np.random.default_rng(2)
+    for number, place in enumerate(rng.choice(len(index.cells), 12, replace=False)):
+        found = looked_up(index, int(place), number % 4, 3)
+        xy = index.grid.xy_from_pixel(index.cells[place] + 0.5)
+        assert np.abs(found.centres[0] - xy).max() <= 32.0
+        np.testing.assert_allclose(found.poses[0, :2], xy)
+        assert math.cos(found.poses[0, 2] - number % 4 * math.pi / 2) > 1 - 1e-6
+        assert (np.diff(found.scores) <= 0).all()
+        assert len({tuple(centre) for centre in found.centres.tolist()}) == 3
+
+
+def test_the_search_is_exact(index: PlaceIndex) -> None:
+    """Cosines are those of each place turned by hand; voting on every place gives the same as voting on the best."""
+    orders = torch.arange(RINGS.orders + 1)
+    scan, factors = index.embeddings[7], order_factors(RINGS.orders + 1)
+    found = index.similarities(scan)
+    for place, bin_ in ((0, 0), (7, 0), (30, 11), (31, 60)):
+        turned = scan * torch.exp(-1j * orders * (bin_ * 2 * math.pi / HEADINGS))[:, None]
+        by_hand = float(((turned.conj() * index.embeddings[place]).sum(1).real * factors).sum())
+        assert found[place, bin_] == pytest.approx(by_hand, abs=1e-5)
+    few, all_of_them = (looked_up(index, 7, 1, 1, shortlist) for shortlist in (5, len(index.cells)))
+    np.testing.assert_array_equal(few.poses[0], all_of_them.poses[0])
+    assert few.scores[0] == pytest.approx(all_of_them.scores[0], rel=1e-5)
+
+
+def test_votes_at_places_are_those_of_the_whole_map() -> None:
+    generator = torch.Generator().manual_seed(8)
+    features, scan = (torch.randn(3, *size, generator=generator) for size in ((40, 44), (12, 12)))
+    yaws = torch.arange(24, dtype=torch.float64) * (2 * math.pi / 24)
+    everywhere = vote(features, scan, yaws).numpy()  # position (r, c) is the corner (r + 6, c + 6) of the map
+    corners = np.array([[6, 6], [10, 20], [25, 29]])
+    found = vote_at(features, scan, corners, 4, 24)
+    for (row, col), votes in zip(corners - 6, found, strict=True):
+        best = everywhere[:, row : row + 4, col : col + 4].max(axis=(1, 2))
+        np.testing.assert_allclose(votes, best, rtol=1e-4, atol=1e-3)
+    with pytest.raises(SkyfixError, match=r"scan features: expected \(3, n, n\), n even, got \(2, 12, 12\)"):
+        vote_at(features, scan[:2], corners, 4, 24)
+
+
+def test_an_embedding_is_as_like_itself_at_every_heading() -> None:
+    generator = torch.Generator().manual_seed(5)
+    scan = torch.randn(RINGS.orders + 1, 5, generator=generator, dtype=torch.complex64)
+    phase = torch.exp(1j * torch.arange(RINGS.orders + 1) * (2 * math.pi * 7 / 72))[:, None]
+    plain, turned = (similarities(each, scan[None], 72)[0] for each in (scan, scan * phase))
+    torch.testing.assert_close(torch.roll(plain, 7), turned, atol=1e-3, rtol=1e-4)
+
+
+def test_places_are_near_roads_and_not_in_houses(index: PlaceIndex) -> None:
+    raster = town()
+    row, col = raster.grid.pixel_from_xy(index.grid.xy_from_pixel(index.cells + 0.5)).astype(int).T
+    assert raster.classes is not None
+    assert not (raster.classes[row, col] == CLASS_INDEX["building"]).any()
+    near_cross = np.minimum(np.abs(row - 198), np.abs(col - 238)) * 0.5
+    assert near_cross.max() <= 4.0 + 4.5  # half a road's width, and what counts as near
+
+
+def test_map_features_are_those_of_windows(matcher: RotMatch) -> None:
+    """The first window is what the network gives for the crop about it, cut to its middle."""
+    with torch.inference_mode():
+        features, grid = map_features(matcher.net, town())
+        crop = town().crop(MapGrid(624, 624, 0.5, TOWN.x0 - 28.0, TOWN.y0 + TOWN.height_m + 28.0 - 312.0))
+        alone = matcher.net.map_features(picture_tensor(crop.picture)[None])[0]
+    assert (grid.x0, grid.y0 + grid.height_m) == (TOWN.x0, TOWN.y0 + TOWN.height_m)
+    assert grid.metres_per_pixel == 1.0
+    torch.testing.assert_close(features, alone[:, 28:284, 28:284])
+
+
+def test_an_index_comes_back_and_answers_alike(index: PlaceIndex, tmp_path: Path) -> None:
+    index.save(tmp_path / "town.npz")
+    back = PlaceIndex.load(tmp_path / "town.npz")
+    assert (back.grid, back.tile_cells, back.fingerprint) == (index.grid, index.tile_cells, index.fingerprint)
+    np.testing.assert_array_equal(back.cells, index.cells)
+    assert (back.feature_m, back.temperature) == (index.feature_m, index.temperature)
+    torch.testing.assert_close(back.features, index.features, rtol=0, atol=0)
+    answers = looked_up(back, 3, 2, 4), looked_up(index, 3, 2, 4)
+    np.testing.assert_allclose(answers[0].poses[0], answers[1].poses[0])
+
+
+def test_an_embedding_comes_back(matcher: RotMatch, tmp_path: Path) -> None:
+    one = embedding_of(matcher)
+    one.save(tmp_path / "places.safetensors")
+    back = PlaceEmbedding.load(tmp_path / "places.safetensors")
+    assert (back.network, back.harmonics) == (one.network, one.harmonics)
+    torch.testing.assert_close(back.scan_weights, one.scan_weights, atol=2e-3, rtol=2e-3)
+
+
+def test_scans_are_looked_up_and_the_same_twice(matcher: RotMatch, index: PlaceIndex) -> None:
+    retriever = Retriever(matcher, embedding_of(matcher))
+    first, again = (retriever.query(index, made_points(), -1.7, 5) for _ in range(2))
+    np.testing.assert_array_equal(first.poses, again.poses)
+    np.testing.assert_array_equal(first.scores, again.scores)
+
+
+def test_a_filter_starts_from_an_answer(index: PlaceIndex) -> None:
+    """The answer is a density over the map's places that integrates to 1; the seed decides on what is drawn."""
+    found = looked_up(index, 20, 1, 5)
+    likelihood = index.likelihood(found)
+    step = 2 * math.pi / HEADINGS
+    row, col, turn = np.meshgrid(*(np.arange(n) for n in (index.grid.rows, index.grid.cols, HEADINGS)), indexing="ij")
+    xy = index.grid.xy_from_pixel(np.stack([row, col], axis=-1).reshape(-1, 2) + 0.5)
+    density = np.exp(likelihood.draw_log_density(np.column_stack([xy, turn.reshape(-1) * step])))
+    assert density.sum() * index.grid.metres_per_pixel**2 * step == pytest.approx(1.0, abs=1e-3)
+    particles = likelihood.sample(2000, np.random.default_rng(0))
+    np.testing.assert_array_equal(particles, likelihood.sample(2000, np.random.default_rng(0)))
+    cells = {tuple(cell) for cell in index.cells.tolist()}
+    drawn = np.floor(index.grid.pixel_from_xy(particles[:, :2]) - 1e-9).astype(int)
+    assert np.mean([tuple(cell) in cells for cell in drawn.tolist()]) > 0.999
+    best = np.abs(particles[:, :2] - found.poses[0, :2]).max(axis=1) <= 4.0  # the best place's own cell
+    assert best.mean() > 5.0 / len(cells)
+    assert len(ParticleFilter(particles, 0).particles) == 2000
+
+
+def test_the_shipped_embedding_finds_tiles_of_a_simulated_town() -> None:
+    """8 scans of a town that nobody trained on, 25 tiles at least: 5 of 8 among the first 3 by chance has 0.1 %."""
+    grid = MapGrid(720, 720, 0.5, 0.0, 0.0)
+    rng = np.random.default_rng(5)
+    classes = np.full((720, 720), CLASS_INDEX["grass"], np.uint8)
+    for _ in range(160):
+        row, col = rng.integers(0, 700, 2)
+        classes[row : row + rng.integers(16, 50), col : col + rng.integers(16, 50)] = CLASS_INDEX["building"]
+    streets = rng.permutation(np.arange(60, 700, 130)) + rng.integers(-30, 30, 5)
+    for street in streets:
+        classes[street - 7 : street + 7] = CLASS_INDEX["road"]
+        classes[:, street - 17 : street - 3] = CLASS_INDEX["road"]
+    raster = MapRaster.from_classes(grid, classes)
+    world, model = world_from_raster(raster, 3), LidarModel(azimuths=600)
+    retriever = Retriever(RotMatch.shipped())
+    index = retriever.build(raster)
+    assert 25 <= index.tiles <= 36
+    right = 0
+    for number in range(8):
+        along, street = rng.uniform(80.0, 280.0), 360.0 - streets[number % 5] * 0.5
+        pose = np.array([along, street - 1.5, 0.0 if number % 2 else math.pi])
+        points = simulate_scan(world, pose, model, np.random.default_rng(number))
+        found = retriever.query(index, points, -model.mount_height_m, 3, shortlist=64)
+        right += bool((np.abs(found.centres - pose[:2]) <= 32.0).all(axis=1).any())
+    assert right >= 5
+
+
+@pytest.mark.parametrize(("k", "shortlist"), [(0, 72), (3, 0)])
+def test_nothing_asked_for(index: PlaceIndex, k: int, shortlist: int) -> None:
+    with pytest.raises(SkyfixError, match=f"expected k and shortlist of 1 or more, got {k} and {shortlist}"):
+        index.query(index.embeddings[0], torch.zeros(4, 20, 20), k, shortlist)
+
+
+def test_bad_input_is_one_line(matcher: RotMatch, index: PlaceIndex, tmp_path: Path) -> None:
+    with pytest.raises(SkyfixError, match=r"scan embedding: expected \(7, 5\), got \(3, 5\)"):
+        index.similarities(torch.zeros(3, 5, dtype=torch.complex64))
+    with pytest.raises(SkyfixError, match=r"index none.npz: expected a file that PlaceIndex.save wrote"):
+        PlaceIndex.load(tmp_path / "none.npz")
+    (tmp_path / "broken.safetensors").write_bytes(b"nothing")
+    with pytest.raises(SkyfixError, match=r"place embedding broken.safetensors: expected a readable file"):
+        PlaceEmbedding.load(tmp_path / "broken.safetensors")
+    with pytest.raises(SkyfixError, match="expected rising radii"):
+        RingHarmonics((8.0, 4.0))
+    with pytest.raises(SkyfixError, match="tiles: expected a multiple of a positive step_m"):
+        TileSettings(step_m=7.0)
+    with pytest.raises(SkyfixError, match="tiles: expected a step_m of a multiple of 2 m, got 1 m"):
+        Retriever(matcher, embedding_of(matcher)).build(town(), TileSettings(step_m=1.0))
+    with pytest.raises(SkyfixError, match="index: expected one of weights"):
+        Retriever(matcher, embedding_of(matcher)).query(replace(index, fingerprint="others"), made_points(), -1.7)
+    torch.manual_seed(9)
+    other = RotMatch(RotMatchNet(RotMatchSettings(4, (4, 4, 8, 8), BevSettings(20.0))))
+    with pytest.raises(SkyfixError, match="place embedding: expected one of the features of weights"):
+        Retriever(other, embedding_of(matcher))
+    houses = np.full((TOWN.rows, TOWN.cols), CLASS_INDEX["building"], np.uint8)
+    with pytest.raises(SkyfixError, match="expected a map with somewhere to drive"):
+        Retriever(matcher, embedding_of(matcher)).build(MapRaster.from_classes(TOWN, houses))

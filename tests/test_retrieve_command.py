@@ -1,0 +1,49 @@
+"""What `skyfix retrieve` counts, and an index file of another map is refused."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from made_drive import FRAMES, MadeDrive, write_made_drive
+
+from fusion.errors import SkyfixError
+from learned.bev import BevSettings
+from learned.place_embedding import PlaceEmbedding
+from learned.retrieval import Retriever, fingerprint_of
+from learned.ring_harmonics import RingHarmonics
+from learned.rotmatch import RotMatch, RotMatchNet, RotMatchSettings
+from sequences.registry import open_sequence
+from sequences.retrieval import index_of, score_retrieval
+
+
+@pytest.fixture(scope="module")
+def retriever() -> Retriever:
+    """Of a network and an embedding that know nothing."""
+    torch.manual_seed(0)
+    matcher = RotMatch(RotMatchNet(RotMatchSettings(4, (4, 4, 8, 8), BevSettings(20.0))))
+    rings = RingHarmonics((4.0, 8.0, 16.0), orders=4, cell_m=2.0, reach_m=20.0)
+    weights = torch.randn(5, 12, 3, dtype=torch.complex64)
+    return Retriever(matcher, PlaceEmbedding(weights, weights, *torch.zeros(2, 12), fingerprint_of(matcher.net), rings))
+
+
+def test_on_a_map_of_few_tiles_the_right_one_is_among_them(
+    made_drive: MadeDrive, retriever: Retriever, tmp_path: Path
+) -> None:
+    """120 m hold 4 tiles: any answer has the right one within 5; an index that was kept scores alike."""
+    opened, kept = open_sequence(made_drive.path), tmp_path / "map.npz"
+    scores = [score_retrieval(opened, retriever, index_of(opened, retriever, kept), 7, 20) for _ in range(2)]
+    assert kept.exists()
+    assert (scores[0]["tiles"], scores[0]["frames"]) == (4, 7)
+    assert scores[0]["recall"]["5"] == scores[0]["recall"]["100"] == 1.0
+    assert scores[0]["tiles"] == scores[1]["tiles"]
+    assert scores[0]["recall"]["1"] == pytest.approx(scores[1]["recall"]["1"], abs=1 / 7)  # embeddings kept as halves
+    everything = score_retrieval(opened, retriever, index_of(opened, retriever, kept), 10 * FRAMES, 20)
+    assert everything["frames"] == FRAMES
+
+
+def test_an_index_of_another_map_is_refused(made_drive: MadeDrive, retriever: Retriever, tmp_path: Path) -> None:
+    opened, kept = open_sequence(made_drive.path), tmp_path / "map.npz"
+    index_of(opened, retriever, kept)
+    other = open_sequence(write_made_drive(tmp_path / "other", map_half_extent_m=70.0).path)
+    with pytest.raises(SkyfixError, match=r"index map.npz: expected one of the map of other, got one of another map"):
+        index_of(other, retriever, kept)
