@@ -180,8 +180,9 @@ class PlaceIndex:
         """
         grid = self.grid
         place = np.array([grid.rows, grid.cols, grid.metres_per_pixel, grid.x0, grid.y0], np.float64)
+        partial = path.with_suffix(".part")
         try:
-            with path.open("wb") as file:
+            with partial.open("wb") as file:
                 np.savez(
                     file,
                     grid=place,
@@ -194,6 +195,7 @@ class PlaceIndex:
                     fingerprint=self.fingerprint,
                     map_digest=self.map_digest,
                 )
+            partial.replace(path)
         except OSError as error:
             raise SkyfixError(f"index {path}: cannot be written: {error.strerror}") from error
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -28,10 +27,10 @@ def retrieve(
     from learned.retrieval import Retriever
     from learned.rotmatch import RotMatch
     from sequences.registry import OpenOptions, open_sequence
-    from sequences.retrieval import index_of, score_retrieval
+    from sequences.retrieval import index_of, recall_table, score_retrieval
 
     opened, retriever = open_sequence(sequence, OpenOptions(seed)), Retriever(RotMatch.shipped())
     index = index_of(opened, retriever, index_file)
     scores = score_retrieval(opened, retriever, index, max_frames, shortlist)
-    typer.echo(json.dumps(scores, indent=1))
+    typer.echo(recall_table(scores), nl=False)
     write_json(json_file, scores)

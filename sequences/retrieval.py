@@ -131,3 +131,20 @@ def score_retrieval(
         "recall": {str(k): float(np.mean(np.array(ranks) < k)) for k in RECALL_AT},
         "seconds_per_scan": seconds / len(ranks),
     }
+
+
+def recall_table(scores: dict[str, Any]) -> str:
+    """What `score_retrieval` gives as Markdown, with the row of the prior: tiles taken at random."""
+    scans = "simulated" if scores["scans_simulated"] else "real"
+    chance = {k: min(int(k) / scores["tiles"], 1.0) for k in scores["recall"]}
+    among = f"{scores['tiles']} tiles ({scores['places']} places)"
+    lines = [
+        f"{scores['sequence']}: {scores['frames']} {scans} scans looked up among {among}",
+        f"{scores['seconds_per_scan']:.2f} s a scan",
+        "",
+        f"| right tile among the first | {' | '.join(scores['recall'])} |",
+        f"|---|{'--:|' * len(scores['recall'])}",
+    ]
+    for name, shares in (("prior", chance), ("retrieval", scores["recall"])):
+        lines.append(f"| {name} | {' | '.join(f'{100 * share:.0f} %' for share in shares.values())} |")
+    return "\n".join(lines) + "\n"

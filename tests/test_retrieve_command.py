@@ -13,7 +13,7 @@ from learned.retrieval import Retriever, fingerprint_of
 from learned.ring_harmonics import RingHarmonics
 from learned.rotmatch import RotMatch, RotMatchNet, RotMatchSettings
 from sequences.registry import open_sequence
-from sequences.retrieval import index_of, score_retrieval
+from sequences.retrieval import index_of, recall_table, score_retrieval
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +39,9 @@ def test_on_a_map_of_few_tiles_the_right_one_is_among_them(
     assert scores[0]["recall"]["1"] == pytest.approx(scores[1]["recall"]["1"], abs=1 / 7)  # embeddings kept as halves
     everything = score_retrieval(opened, retriever, index_of(opened, retriever, kept), 10 * FRAMES, 20)
     assert everything["frames"] == FRAMES
+    table = recall_table(scores[0])
+    assert "7 real scans looked up among 4 tiles" in table
+    assert "| prior | 25 % | 100 % | 100 % | 100 % | 100 % |" in table
 
 
 def test_an_index_of_another_map_is_refused(made_drive: MadeDrive, retriever: Retriever, tmp_path: Path) -> None:

@@ -87,7 +87,8 @@ class GridNoise:
         used = np.arange(weights.shape[2]) < sizes[:, :, None]
         sources = np.broadcast_to(np.arange(planes)[:, None, None], used.shape)[used]
         reached = np.broadcast_to(targets[:, :, None], used.shape)[used]
-        ways = Ways(sources, reached, cells[used], (weights * shares[:, None])[used], planes)
+        weighed = weights[used] * np.broadcast_to(shares[:, None], used.shape)[used]  # the unused are not set
+        ways = Ways(sources, reached, cells[used], weighed, planes)
         return cls(_with_taps(directions, taken), ways)
 
     @classmethod
