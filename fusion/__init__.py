@@ -32,7 +32,8 @@ from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
-from fusion.odometry_calibration import OdometryCalibration, calibrate_odometry
+from fusion.odometry_calibration import calibrate_odometry
+from fusion.odometry_errors import OdometryCalibration
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings, ParticleFilterState
 from fusion.particle_smoother import ParticleSmootherSettings, PathSamples, sample_paths
 from fusion.particles.cloud_history import CloudHistory, RecordedCloud

@@ -34,8 +34,6 @@ from fusion.odometry_errors import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory, checked_stamps
 
-__all__ = ["CalibrationPrior", "OdometryCalibration", "calibrate_odometry"]
-
 _LARGEST_S = 0.45
 _ROUNDS = 3
 _CAUTION = 1.0  # ln of the factor by which the odometry is trusted less before its errors are known

@@ -26,7 +26,7 @@ from fusion.estimate import Estimate
 from fusion.factor_graph import OdometryDrift, SmootherSettings
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.odometry import OdometryNoise, increments_at
-from fusion.odometry_calibration import OdometryCalibration
+from fusion.odometry_errors import OdometryCalibration
 from fusion.particle_filter import ParticleFilter
 from fusion.particle_smoother import ParticleSmootherSettings, sample_paths
 from fusion.particles.cloud_history import CloudHistory

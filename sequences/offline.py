@@ -11,7 +11,8 @@ from fusion.arrays import IntArray
 from fusion.factor_graph import OdometryDrift, SmootherResult, SmootherSettings, smooth
 from fusion.graph.measurements import Measurement
 from fusion.odometry import OdometryNoise, increments_at
-from fusion.odometry_calibration import OdometryCalibration, calibrate_odometry
+from fusion.odometry_calibration import calibrate_odometry
+from fusion.odometry_errors import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fusion.errors import SkyfixError
-from fusion.odometry_calibration import OdometryCalibration
+from fusion.odometry_errors import OdometryCalibration
 
 METRICS_FILE = "metrics.json"
 CONFIG_FILE = "config.yaml"

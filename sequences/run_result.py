@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fusion.arrays import Float32Array, FloatArray
 from fusion.grid import MapGrid
-from fusion.odometry_calibration import OdometryCalibration
+from fusion.odometry_errors import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 from learned.map_raster import MapRaster

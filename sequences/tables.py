@@ -8,7 +8,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from fusion.odometry_calibration import OdometryCalibration
+from fusion.odometry_errors import OdometryCalibration
 
 ROWS = {
     "prior": "prior",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 
 from fusion.errors import SkyfixError
 from fusion.odometry import OdometryNoise
-from fusion.odometry_calibration import OdometryCalibration
+from fusion.odometry_errors import OdometryCalibration
 
 
 @dataclass(frozen=True, slots=True)

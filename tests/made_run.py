@@ -8,7 +8,7 @@ import numpy as np
 
 from fusion import se2
 from fusion.grid import MapGrid
-from fusion.odometry_calibration import OdometryCalibration
+from fusion.odometry_errors import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
 from learned.map_raster import CLASS_INDEX, MapRaster

@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,13 +23,14 @@ import sequences.localize
 import sequences.progress
 import sequences.train_command
 from fusion.errors import SkyfixError
-from fusion.odometry_calibration import OdometryCalibration
+from fusion.odometry_errors import OdometryCalibration
 from sequences.cli import app, main
 from sequences.cli_track import default_odometry
 from sequences.folder import FolderSequence
 from sequences.progress import ConsoleProgress
+from sequences.run_files import read_calibration
 from sequences.run_result import FrameRow
-from sequences.tables import ROWS
+from sequences.tables import ROWS, closing_lines
 from sequences.track_settings import TrackSettings
 from sequences.train_command import TrainOptions
 
@@ -197,6 +198,25 @@ def test_a_run_without_a_calibration_is_named(
     assert finished.code == 2
     assert "filter_calibration" in finished.err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_calibration_without_a_blur_is_one_of_none(tracked: TrackedRun, tmp_path: Path) -> None:
+    """Runs of earlier versions did not look for it."""
+    run = shutil.copytree(tracked.out, tmp_path / "run")
+    metrics = json.loads((run / "metrics.json").read_text())
+    found = OdometryCalibration(**metrics["filter_calibration"])
+    assert read_calibration(run) == found
+    del metrics["filter_calibration"]["heading_blur_s"]
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    assert read_calibration(run) == replace(found, heading_blur_s=0.0)
+
+
+def test_what_was_found_of_the_odometry_is_told(tracked: TrackedRun) -> None:
+    found = OdometryCalibration(-0.11, 0.04, -0.005, 0.014, 0.9, heading_blur_s=0.2, across_noise=0.3)
+    metrics = json.loads((tracked.out / "metrics.json").read_text()) | {"odometry_calibration": asdict(found)}
+    line = next(line for line in closing_lines(metrics) if "stamps" in line)
+    assert "stamps by -0.11 s and its headings by +0.04 s, +0.9 m and +0.29 degrees, sharpened these by 0.2 s" in line
+    assert "distances by +1.4 %; took its noise as 1.0, 0.3 and 1.0" in line
 
 
 def test_view_prints_the_same_table_again(

@@ -17,7 +17,7 @@ from fusion import (
     Trajectory,
     se2,
 )
-from fusion.odometry_calibration import OdometryCalibration
+from fusion.odometry_errors import OdometryCalibration
 from sequences.emulated_odometry import emulate_odometry
 from sequences.emulated_run import EmulatedRunSettings, run_emulated
 from sequences.folder import FolderSequence

@@ -20,7 +20,7 @@ from fusion import (
     UniformPrior,
     se2,
 )
-from fusion.grids.discrete_gaussian import planar_gaussian, symmetric_taps
+from fusion.grids.discrete_gaussian import planar_gaussian, planar_gaussians, symmetric_taps
 from fusion.grids.grid_kernels import selling
 from fusion.grids.grid_motion import GridMotion
 from fusion.grids.scratch import Scratch
@@ -147,6 +147,24 @@ def brute_force(lattice, after, motion, mass):
         error[:, 2] = se2.wrap(error[:, 2])
         result += weights[at] * peak * np.exp(-0.5 * np.einsum("ni,ij,nj->n", error, inverse, error))
     return result.reshape(mass.shape)
+
+
+def test_weights_that_were_never_set_play_no_part(monkeypatch):
+    """Memory beyond the cells that are used may hold anything, signalling NaNs too."""
+    lattice, motion = PoseLattice(GRID, np.zeros((24, 2))), increment([0.8, -0.3, 0.5], COUPLED)
+    mass = np.random.default_rng(2).random(lattice.shape).astype(np.float32)
+    expected, _ = moved(lattice, GridMotion.on(lattice, motion), mass)
+
+    def poisoned(*arguments):
+        sizes, cells, weights = planar_gaussians(*arguments)
+        unused = np.arange(weights.shape[2]) >= sizes[:, :, None]
+        assert unused.any()
+        weights.view(np.uint64)[unused] = 0x7FF4000000000000
+        return sizes, cells, weights
+
+    monkeypatch.setattr("fusion.grids.grid_noise.planar_gaussians", poisoned)
+    found, _ = moved(lattice, GridMotion.on(lattice, motion), mass)
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("coupled", [False, True])

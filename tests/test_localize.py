@@ -19,7 +19,7 @@ from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
-from fusion.odometry_calibration import OdometryCalibration
+from fusion.odometry_errors import OdometryCalibration
 from fusion.trajectory import Trajectory
 from learned.matcher import SearchRegion
 from sequences.drive import load_drive

@@ -91,6 +91,16 @@ def test_a_cavity_that_changes_its_shape_has_moved():
     assert Counted.asked == [3, 3, 3]
 
 
+def test_a_factor_on_its_way_is_looked_at_again_where_its_cavity_stays():
+    """A look goes only most of the way to the new factor, which is nothing to a Gaussian's and much to another's."""
+    centres = at(2)
+    seen = Counted([two_peaks(np.zeros(3)), gaussian(np.zeros(3))], 0.0, -9.2)
+    looks = Looks(seen, centres)
+    for share in (0.0, 3.0, 3.0):
+        looks.renew(centres + share * WINDOW.diagonal() ** 0.5, windows(2))
+    assert Counted.asked == [2, 2, 1]
+
+
 def test_what_is_left_alone_would_not_have_changed_the_answer(monkeypatch):
     """A drive with whole likelihoods of two peaks, smoothed with and without leaving factors alone."""
     rng, count = np.random.default_rng(3), 40

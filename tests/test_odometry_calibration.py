@@ -7,7 +7,8 @@ from fusion import GaussianMixture, OdometryNoise, SmootherSettings, Trajectory,
 from fusion.errors import SkyfixError
 from fusion.factor_graph import OdometryDrift
 from fusion.odometry import increments_at
-from fusion.odometry_calibration import OdometryCalibration, calibrate_odometry
+from fusion.odometry_calibration import calibrate_odometry
+from fusion.odometry_errors import OdometryCalibration
 
 SECOND = 1_000_000_000
 SPEED = 10.0

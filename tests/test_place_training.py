@@ -1,5 +1,7 @@
 """Training place embeddings: pairs hidden in noise are told apart, turns of the scan do not matter, seeds decide."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -54,6 +56,10 @@ def test_it_learns_what_agrees(net: RotMatchNet) -> None:
     assert recall(trained, unseen) >= 9 / 60
     again = train_places(net, pairs, RINGS, SETTINGS)
     torch.testing.assert_close(again.scan_weights, trained.scan_weights, rtol=0, atol=0)
+    together = train_places(net, replace(pairs, positions=pairs.positions * 0.0), RINGS, SETTINGS)
+    assert recall(together, unseen) < 0.12  # scans of one place are not contrasted: nothing to learn
+    kept = train_places(net, pairs, RINGS, replace(SETTINGS, feature_dropout=0.0))
+    assert not torch.allclose(kept.scan_weights, trained.scan_weights, rtol=0.1)
 
 
 def test_pairs_are_made_of_samples(net: RotMatchNet) -> None:
@@ -73,5 +79,8 @@ def test_pairs_are_made_of_samples(net: RotMatchNet) -> None:
     pairs = pairs_of(net, placed, RINGS)
     assert pairs.scans.shape == pairs.places.shape == (3, 4 * 3, 5)
     torch.testing.assert_close(pairs_of(net, placed, RINGS).places, pairs.places, rtol=0, atol=0)
+    there = pairs_of(net, [(sample, np.zeros(2)) for sample in samples], RINGS)
+    torch.testing.assert_close(there.scans, pairs.scans, rtol=0, atol=0)
+    assert not torch.allclose(there.places, pairs.places, rtol=0.1)  # the map is seen from where the offset leads
     with pytest.raises(SkyfixError, match="place training: expected two samples or more, got 1"):
         pairs_of(net, placed[:1], RINGS)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from fusion.particle_filter import ParticleFilter
-from learned.bev import BevSettings
+from learned.bev import BevSettings, bev_counts, log_density
 from learned.map_raster import CLASS_INDEX, MapRaster
 from learned.network import picture_tensor
 from learned.place_embedding import PlaceEmbedding, order_factors, similarities
@@ -124,6 +125,27 @@ def test_the_search_is_exact(index: PlaceIndex) -> None:
     assert few.scores[0] == pytest.approx(all_of_them.scores[0], rel=1e-5)
 
 
+def test_places_are_weighed_in_two_rounds(index: PlaceIndex, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By 20 times the cosine and the vote: less its mean over headings, and as it is for the closest few."""
+    monkeypatch.setattr("learned.place_index._CLOSELY", 20)
+    index = replace(index, temperature=2.0)
+    place, per_cell = 7, round(index.grid.metres_per_pixel / index.feature_m)
+    row, col = index.cells[place] * per_cell + per_cell // 2
+    padded = torch.nn.functional.pad(index.features.float(), (10, 10, 10, 10))
+    scan = padded[:, row : row + 20, col : col + 20].contiguous()
+    found = index.query(index.embeddings[place], scan, 1).place_scores
+    alike = 20.0 * index.similarities(index.embeddings[place]).max(axis=1, keepdims=True)
+    finer = vote_at(index.features, scan, index.cells * per_cell, per_cell, 3 * HEADINGS) / index.temperature
+    votes = finer[:, ::3]
+    weighed = votes - votes.mean(axis=1, keepdims=True) + alike
+    closest, others = np.split(np.argsort(-weighed.max(axis=1), kind="stable"), [20])
+    assert len(others) > 10
+    closely = np.maximum(np.maximum(finer[:, ::3], finer[:, 1::3]), np.roll(finer[:, 2::3], 1, axis=1)) + alike
+    np.testing.assert_allclose(found[closest], closely[closest], rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(found[others] - weighed[others], (found - weighed)[others[0], 0], rtol=1e-3, atol=1e-3)
+    assert found[others].max() == pytest.approx(found[closest].max(axis=1).min(), rel=1e-4)
+
+
 def test_votes_at_places_are_those_of_the_whole_map() -> None:
     generator = torch.Generator().manual_seed(8)
     features, scan = (torch.randn(3, *size, generator=generator) for size in ((40, 44), (12, 12)))
@@ -177,6 +199,23 @@ def test_an_index_comes_back_and_answers_alike(index: PlaceIndex, tmp_path: Path
     np.testing.assert_allclose(answers[0].poses[0], answers[1].poses[0])
 
 
+def test_an_index_that_cannot_be_written_leaves_the_one_before(
+    index: PlaceIndex, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "town.npz"
+    index.save(path)
+    before = path.read_bytes()
+
+    def full(file: BinaryIO, **arrays: object) -> None:
+        file.write(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(SkyfixError, match=r"town.npz: cannot be written: No space left on device"):
+        index.save(path)
+    assert path.read_bytes() == before
+
+
 def test_an_embedding_comes_back(matcher: RotMatch, tmp_path: Path) -> None:
     one = embedding_of(matcher)
     one.save(tmp_path / "places.safetensors")
@@ -190,6 +229,13 @@ def test_scans_are_looked_up_and_the_same_twice(matcher: RotMatch, index: PlaceI
     first, again = (retriever.query(index, made_points(), -1.7, 5) for _ in range(2))
     np.testing.assert_array_equal(first.poses, again.poses)
     np.testing.assert_array_equal(first.scores, again.scores)
+    # The vote counts all that the scan shows: a coarse cell of it is the sum of the fine ones.
+    counts = torch.from_numpy(log_density(bev_counts(made_points(), -1.7, matcher.net.settings.bev)))[None].float()
+    with torch.inference_mode():
+        seen = matcher.net.scan_features(counts)[0]
+        summed = seen.unfold(1, 2, 2).unfold(2, 2, 2).sum(dim=(3, 4))
+        scan = embedding_of(matcher).of_scans(RINGS.of(torch.nn.functional.avg_pool2d(seen[None], 2), RINGS.basis()))[0]
+    np.testing.assert_allclose(first.scores, index.query(scan, summed, 5).scores, rtol=1e-4)
 
 
 def test_a_filter_starts_from_an_answer(index: PlaceIndex) -> None:

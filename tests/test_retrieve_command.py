@@ -1,15 +1,20 @@
 """What `skyfix retrieve` counts, and an index file of another map is refused."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from made_drive import FRAMES, MadeDrive, write_made_drive
+from numpy.typing import NDArray
 
 from fusion.errors import SkyfixError
 from learned.bev import BevSettings
+from learned.map_raster import MapRaster
 from learned.place_embedding import PlaceEmbedding
-from learned.retrieval import Retriever, fingerprint_of
+from learned.place_index import PlaceIndex, Retrieved
+from learned.retrieval import Retriever, fingerprint_of, map_digest
 from learned.ring_harmonics import RingHarmonics
 from learned.rotmatch import RotMatch, RotMatchNet, RotMatchSettings
 from sequences.registry import open_sequence
@@ -44,9 +49,35 @@ def test_on_a_map_of_few_tiles_the_right_one_is_among_them(
     assert "| prior | 25 % | 100 % | 100 % | 100 % | 100 % |" in table
 
 
+@dataclass
+class SecondBest:
+    """Answers with the tile east of the right one, then the right one; knows the truth by the order it is asked in."""
+
+    truths: NDArray[np.float64]
+    asked: int = 0
+
+    def query(self, index: PlaceIndex, points: object, ground_z: float, k: int, shortlist: int) -> Retrieved:
+        right = self.truths[self.asked, :2] + [20.0, -31.0]
+        self.asked += 1
+        centres = np.array([right + [64.0, 0.0], right])
+        return Retrieved(centres, np.zeros((2, 3)), np.array([1.0, 0.0]), np.zeros((1, 1), np.float32))
+
+
+def test_the_rank_counted_is_that_of_the_tile_that_holds_the_truth(made_drive: MadeDrive, retriever: Retriever) -> None:
+    opened = open_sequence(made_drive.path)
+    scores = score_retrieval(opened, SecondBest(made_drive.truth.poses), index_of(opened, retriever, None), 10 * FRAMES)
+    assert scores["recall"] == {"1": 0.0, "5": 1.0, "10": 1.0, "50": 1.0, "100": 1.0}
+
+
 def test_an_index_of_another_map_is_refused(made_drive: MadeDrive, retriever: Retriever, tmp_path: Path) -> None:
     opened, kept = open_sequence(made_drive.path), tmp_path / "map.npz"
     index_of(opened, retriever, kept)
     other = open_sequence(write_made_drive(tmp_path / "other", map_half_extent_m=70.0).path)
     with pytest.raises(SkyfixError, match=r"index map.npz: expected one of the map of other, got one of another map"):
         index_of(other, retriever, kept)
+    raster = opened.map
+    assert raster.classes is not None
+    classes = raster.classes.copy()
+    assert map_digest(MapRaster.from_classes(raster.grid, classes)) == map_digest(raster)
+    classes[0, 0] += 1
+    assert map_digest(MapRaster.from_classes(raster.grid, classes)) != map_digest(raster)

@@ -106,18 +106,25 @@ def test_the_contrast_is_nothing_at_the_right_place_and_much_elsewhere(lattice: 
         assert search.contrast(scan, pose + [1e4, 0.0, 0.0]) > 5.0
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_contrast_is_that_of_the_ordinary_vote_over_the_whole_map(lattice: MapLattice, seed: int) -> None:
-    found, scan, pose = scene(lattice, seed)
-    search, everywhere = MapSearch(found, lattice, YAW_BINS, 1.0, CLOSE), narrow(found, scan, lattice)
-    elsewhere = pose + [-22.0, 4.0, 1.0]
-    x, y = everywhere.grid.centres()
-    yaw = np.arange(YAW_BINS) * 2 * np.pi / YAW_BINS
-    about = (np.abs(x - elsewhere[0]) < 12.0)[None, :, None] & (np.abs(y - elsewhere[1]) < 12.0)[:, None, None]
-    about = about & (np.abs(np.angle(np.exp(1j * (yaw - elsewhere[2])))) < np.deg2rad(28.0))
-    expected = everywhere.log_prob.max() - everywhere.log_prob.max(where=about, initial=-np.inf)
-    # Only a few places are looked at closely: what is best near the pose may be missed, never overstated.
-    assert expected - 2e-3 <= search.contrast(scan, elsewhere) < 1.3 * expected + 1.0
+def test_the_contrast_is_nearly_that_of_the_ordinary_vote_over_the_whole_map(lattice: MapLattice) -> None:
+    """Few places are looked at closely: what is best near a pose may be missed a little, which adds to the contrast.
+
+    By 0.7 nats of 12 in the mean; by 1.3 without the pose itself and 1.8 without the best place near it.
+    """
+    excess = []
+    for seed in range(4):
+        found, scan, pose = scene(lattice, seed)
+        search, everywhere = MapSearch(found, lattice, YAW_BINS, 1.0, CLOSE), narrow(found, scan, lattice)
+        for offset in ([-22.0, 4.0, 1.0], [15.0, -9.0, -2.0], [-6.0, 18.0, 2.0]):
+            elsewhere = pose + offset
+            x, y = everywhere.grid.centres()
+            yaw = np.arange(YAW_BINS) * 2 * np.pi / YAW_BINS
+            about = (np.abs(x - elsewhere[0]) < 12.0)[None, :, None] & (np.abs(y - elsewhere[1]) < 12.0)[:, None, None]
+            about = about & (np.abs(np.angle(np.exp(1j * (yaw - elsewhere[2])))) < np.deg2rad(28.0))
+            expected = everywhere.log_prob.max() - everywhere.log_prob.max(where=about, initial=-np.inf)
+            excess.append(search.contrast(scan, elsewhere) - expected)
+    assert min(excess) > -2e-3
+    assert np.mean(excess) < 1.0
 
 
 def test_a_prior_of_the_map_counts_as_in_the_ordinary_vote(lattice: MapLattice) -> None:
