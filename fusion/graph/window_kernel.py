@@ -18,14 +18,14 @@ from fusion.kernels.float_math import intrinsic
 _WIDE_CELLS = 1.5  # standard deviations of a window along each axis from which cells are sampled well enough
 
 
-@numba.njit(**OPTIONS)
+@numba.njit(forceinline=True, **OPTIONS)
 def _is_wide(root: NDArray[np.float64], metres: float, radians: float) -> bool:
     """Whether the window's standard deviations given the other axes are wide against the cells."""
     least = min(root[0, 0], root[1, 1]) / metres
     return min(least, root[2, 2] / radians) > _WIDE_CELLS
 
 
-@numba.njit(**OPTIONS)
+@numba.njit(forceinline=True, **OPTIONS)
 def _sum_cells(
     patch: NDArray[np.float32],
     first: NDArray[np.float64],

@@ -109,7 +109,7 @@ def _along(
     return float(mass), float(flank), float(square)
 
 
-@numba.njit(**OPTIONS)
+@numba.njit(forceinline=True, **OPTIONS)
 def sum_lattice(
     patch: NDArray[np.float32],
     wraps: bool,

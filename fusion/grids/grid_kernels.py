@@ -53,7 +53,7 @@ def selling(tensors: FloatArray, directions: IntArray, variances: FloatArray) ->
             directions[k, c, 0], directions[k, c, 1] = -base[c, 1], base[c, 0]
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(fastmath=True, forceinline=True, nogil=True)
 def _blur_along(
     source: Float32Array, target: Float32Array, taps: Float32Array, radius: int, down: int, right: int, margin: int
 ) -> None:
@@ -75,7 +75,7 @@ def _blur_along(
                 out[c] += taps[n] * (before[c] + after[c])
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(fastmath=True, forceinline=True, nogil=True)
 def _sum(values: Float32Array, top: int, bottom: int, left: int, right: int) -> float:
     total = 0.0
     for r in range(top, bottom):
@@ -85,7 +85,7 @@ def _sum(values: Float32Array, top: int, bottom: int, left: int, right: int) -> 
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(forceinline=True, nogil=True)
 def _window(start: int, count: int, size: int) -> tuple[int, int]:
     """The part of ``[start, start + count)`` that lies in ``[0, size)``."""
     first = min(max(start, 0), size)

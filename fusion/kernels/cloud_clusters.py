@@ -9,7 +9,7 @@ import math
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import KERNEL, F, larger, put, sine_cosine, take
+from fusion.kernels.float_math import INLINED, KERNEL, F, larger, put, sine_cosine, take
 from fusion.kernels.layout import BLOCK, CLUSTER_SIZE, Float32s, Float64s, Int32s
 
 _ROUNDING = 1e-14
@@ -52,7 +52,7 @@ def cells_of_cloud(cloud: Float32s, x0: float, y0: float, cell_m: float, cols: i
     return cells
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def _directions(yaws: Float32s, sines: Float32s, cosines: Float32s) -> None:
     for i in range(len(yaws)):
         sines[i], cosines[i] = sine_cosine(yaws[i])

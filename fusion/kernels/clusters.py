@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels.float_math import KERNEL, F, sine_cosine
+from fusion.kernels.float_math import INLINED, F, sine_cosine
 from fusion.kernels.layout import BLOCK, E0, E1, E2, MOTION_STREAM, SCRATCH_SIZE
 from fusion.kernels.motion import three_normals
 
@@ -66,7 +66,7 @@ def components(cells: NDArray[Any], size: int, cols: int, yaw_cells: int) -> tup
     return labels, count
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def _directions(poses: NDArray[np.float64], sines: NDArray[np.float32], cosines: NDArray[np.float32]) -> None:
     for i in range(len(poses)):
         sines[i], cosines[i] = sine_cosine(F(poses[i, 2]))

@@ -16,9 +16,14 @@ from llvmlite import ir
 from numba import extending, types
 
 INLINED: dict[str, Any] = {"fastmath": True, "forceinline": True, "nogil": True, "error_model": "numpy"}
-"""Options of functions that are to disappear into the loop that calls them."""
+"""Options of functions that compiled code calls: they disappear into it.
+
+One that stayed a function of its own would be optimised once for itself and once more within its caller, to other
+roundings, and which of the two is run depends on what the process has loaded: the first run, which compiles, would give
+other numbers than the next.
+"""
 KERNEL: dict[str, Any] = {"fastmath": True, "nogil": True, "error_model": "numpy", "cache": True}
-"""Options of functions that Python calls, or a loop over blocks."""
+"""Options of functions that Python calls."""
 
 intrinsic: Any = extending.intrinsic
 """As untyped as what it makes: a function of the compiled side, whose first argument the caller does not give."""

@@ -12,7 +12,7 @@ Source: streaming log-sum-exp with one maximum a block; circular means after Mar
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import KERNEL, F, exp, larger, sine_cosine, widest, wrap
+from fusion.kernels.float_math import INLINED, KERNEL, F, exp, larger, sine_cosine, widest, wrap
 from fusion.kernels.layout import (
     ADDED,
     ARC,
@@ -48,7 +48,7 @@ from fusion.kernels.layout import (
 )
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def block_moments(
     start: int,
     n: int,

@@ -4,12 +4,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels.float_math import KERNEL, F, get, put, sine_cosine, take, widest, wrap
+from fusion.kernels.float_math import INLINED, F, get, put, sine_cosine, take, widest, wrap
 from fusion.kernels.layout import BLOCK, CLUSTER_SIZE, E0, E1, E2, E3, E4, E5, Float32s, Float64s, Int32s, T, X, Y
 from fusion.kernels.random import U, normal_pair, threefry
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def three_normals(
     start: int, n: int, step: np.uint32, stream: np.uint32, key: NDArray[np.uint32], row: int, s: Float32s
 ) -> None:
@@ -27,7 +27,7 @@ def three_normals(
         s[other + BLOCK + j], s[other + 2 * BLOCK + j] = normal_pair(c, U(d >> U(20)))
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def fetch(source: Float32s, ancestors: Int32s, start: int, n: int, s: Float32s) -> None:
     """Read the ancestors of a block, or the block itself when nothing has been resampled."""
     widest()
@@ -43,7 +43,7 @@ def fetch(source: Float32s, ancestors: Int32s, start: int, n: int, s: Float32s) 
                 put(s, axis * BLOCK + j, take(column, take(ancestors, np.int32(start + j))))
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def regularise(n: int, motion: Float64s, s: Float32s) -> None:
     """Draw a block towards the mean and add kernel noise, see `fusion.particles.regularisation`."""
     widest()
@@ -58,7 +58,7 @@ def regularise(n: int, motion: Float64s, s: Float32s) -> None:
         s[T + j] = wrap(turned + (r20 * e0 + r21 * e1 + r22 * e2))
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def regularise_in_clusters(start: int, n: int, labels: Int32s, clusters: Float32s, s: Float32s) -> None:
     """As `regularise`, with the mean, factor and root of each particle's own cluster: `CLUSTER_SIZE` numbers each."""
     widest()
@@ -79,7 +79,7 @@ def regularise_in_clusters(start: int, n: int, labels: Int32s, clusters: Float32
         put(s, T + j, wrap(turned + (r20 * e0 + r21 * e1 + r22 * e2)))
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def advance(n: int, motion: Float64s, s: Float32s) -> None:
     """Compose a block with the increment and its noise."""
     widest()

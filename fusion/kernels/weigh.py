@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from fusion.kernels.float_math import INLINED, KERNEL, F, exp, get, larger, log, put, take, widest
+from fusion.kernels.float_math import INLINED, F, exp, get, larger, log, put, take, widest
 from fusion.kernels.layout import (
     ADDED,
     BIN_STRIDE,
@@ -61,7 +61,7 @@ def _mix_outliers(n: int, inlier: np.float32, uniform: np.float32, s: Float32s) 
         s[ADDED + j] = log(inlier * exp(s[ADDED + j]) + uniform)
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def weigh_by_volume(n: int, table: Float32s, look: Float64s, s: Float32s) -> None:
     """ln density of a block under a volume that has the headings of a cell side by side."""
     widest()
@@ -110,7 +110,7 @@ def _pixel_level(
     return low + kw * (high - low)
 
 
-@numba.njit(**KERNEL)
+@numba.njit(**INLINED)
 def weigh_by_maps(
     n: int,
     table: Float32s,
