@@ -61,7 +61,9 @@ app.command(
     "`skyfix export rotmatch --out exported`\n\n"
     "`skyfix export runs/training/rotmatch.safetensors --out exported --int8 drives/kitti_13`"
 )(export)
-app.command(epilog="Example: `skyfix retrieve drives/kitti_360 --index maps/karlsruhe.npz`")(retrieve)
+app.command(epilog="Example: `skyfix retrieve drives/kitti_360 --index maps/karlsruhe.npz --places places.csv`")(
+    retrieve
+)
 
 
 @app.command(epilog="Example: `skyfix convert KITTI/raw_data/2011_09_26/2011_09_26_drive_0013_sync drives/kitti_13`")
