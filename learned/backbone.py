@@ -52,7 +52,10 @@ class BackboneSettings:
 
 
 def normalisation(channels: int) -> nn.GroupNorm:
-    """Group normalisation of `CHANNELS_PER_GROUP` channels a group."""
+    """Group normalisation of `CHANNELS_PER_GROUP` channels a group, which does not depend on the batch.
+
+    TransLocNet's ResNet-34 has batch normalisation, which needs larger batches than fit a CPU's memory.
+    """
     return nn.GroupNorm(channels // CHANNELS_PER_GROUP, channels)
 
 
