@@ -33,6 +33,28 @@ def map_box(grid: MapGrid) -> UniformPrior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Predicted:
+    """A filter that has been moved to a measurement and not been weighed by it.
+
+    Attributes
+    ----------
+    poses, log_weights
+        (N, 3) and (N,) of its particles.
+    lost_score
+        Its probability of being lost.
+    """
+
+    poses: FloatArray
+    log_weights: FloatArray
+    lost_score: float
+
+    @classmethod
+    def of(cls, particles: ParticleFilter) -> Predicted:
+        """The filter as it is now."""
+        return cls(particles.particles, particles.log_weights, particles.lost_score)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class GivenUp:
     """What is known of a vehicle that was given up; a `start_cloud.StartPrior`.
 
@@ -51,10 +73,10 @@ class GivenUp:
     lost: float
 
     @classmethod
-    def by(cls, particles: ParticleFilter, grid: MapGrid) -> GivenUp:
-        """From the filter, as it is."""
-        lost = min(max(particles.lost_score, _LOST_RANGE[0]), _LOST_RANGE[1])
-        return cls(map_box(grid), LatticeDensity.of(particles.particles, particles.log_weights), lost)
+    def by(cls, predicted: Predicted, grid: MapGrid) -> GivenUp:
+        """From a filter before the measurement that the search begins with."""
+        lost = min(max(predicted.lost_score, _LOST_RANGE[0]), _LOST_RANGE[1])
+        return cls(map_box(grid), LatticeDensity.of(predicted.poses, predicted.log_weights), lost)
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw poses (n, 3)."""

@@ -18,7 +18,7 @@ from fusion.two_level import TwoLevelLikelihood
 from learned.map_raster import MapRaster
 from learned.matcher import MapMatcher, SearchRegion
 from learned.whole_map import WholeMapSearch, search_over
-from sequences.anywhere import Candidates, GivenUp, map_box
+from sequences.anywhere import Candidates, GivenUp, Predicted, map_box
 from sequences.start_cloud import MOST_MEASUREMENTS, StartCloud
 from sequences.track_settings import TrackSettings
 
@@ -85,7 +85,7 @@ class AnywhereSearch:
 
     def update(
         self,
-        particles: ParticleFilter | None,
+        predicted: Predicted | None,
         likelihood: TwoLevelLikelihood,
         temperature: float,
         motion: OdometryIncrement | None,
@@ -94,16 +94,16 @@ class AnywhereSearch:
 
         Parameters
         ----------
-        particles
-            The filter, moved to this measurement and not weighed by it; None at the start of a drive.
+        predicted
+            The filter before this measurement; None at the start of a drive.
         likelihood, temperature
             The measurement.
         motion
             Odometry since the one before; not looked at for the first.
         """
-        if self._cloud is None or (particles is not None and len(self._cloud) >= MOST_MEASUREMENTS):
+        if self._cloud is None or (predicted is not None and len(self._cloud) >= MOST_MEASUREMENTS):
             grid, settings = self._map.grid, self._settings
-            prior = map_box(grid) if particles is None else GivenUp.by(particles, grid)
+            prior = map_box(grid) if predicted is None else GivenUp.by(predicted, grid)
             count = max(settings.particles, _LEAST_PARTICLES)
             self._cloud = StartCloud(prior, count, settings.outlier_probability, self._rng)
             motion = None

@@ -17,6 +17,7 @@ from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.prior import UniformPrior
 from fusion.two_level import TwoLevelLikelihood
 from learned.matcher import MapMatcher
+from sequences.anywhere import Predicted
 from sequences.anywhere_search import AnywhereSearch
 from sequences.drive import Drive
 from sequences.map_watch import MapWatch
@@ -108,10 +109,11 @@ class FilterPass:
                 self._move(self._filter, frame)
             measurement, reason = self._measure_if_due(self._filter, frame, watch)
             if measurement is not None:
+                predicted = Predicted.of(self._filter)
                 with watch("update"):
                     evidence = self._update(self._filter, frame, measurement)
                 with watch("match"):
-                    self._look_around(self._filter, frame, measurement)
+                    self._look_around(self._filter, predicted, frame, measurement)
         estimate = self._estimate(self._filter, frame)
         self._keep(frame, estimate, measurement)
         self.rows.append(
@@ -210,7 +212,7 @@ class FilterPass:
     def _update(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> float:
         if isinstance(measurement.likelihood, TwoLevelLikelihood):
             density = measurement.likelihood.log_density(particles.particles)
-            self._update_anywhere(particles, frame, measurement.likelihood, measurement.temperature)
+            self._update_anywhere(Predicted.of(particles), frame, measurement.likelihood, measurement.temperature)
             return float(logsumexp(density + particles.log_weights))
         report = particles.update(measurement.likelihood, measurement.temperature)
         if self._plan.record(measurement.search, report.log_evidence, report.lost_score):
@@ -223,10 +225,10 @@ class FilterPass:
         return report.log_evidence
 
     def _update_anywhere(
-        self, particles: ParticleFilter, frame: int, likelihood: TwoLevelLikelihood, temperature: float
+        self, predicted: Predicted, frame: int, likelihood: TwoLevelLikelihood, temperature: float
     ) -> None:
         """Weigh all places on the map; track the one that wins."""
-        particles = self._anywhere.update(particles, likelihood, temperature, accumulate(self._since_measured))
+        particles = self._anywhere.update(predicted, likelihood, temperature, accumulate(self._since_measured))
         share = self._anywhere.share(particles)
         if self._plan.record_places(share):
             particles = self._anywhere.settle(particles)
@@ -235,8 +237,13 @@ class FilterPass:
             self._note(frame, f"found at ({x:.1f}, {y:.1f})")
         self._filter = particles
 
-    def _look_around(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> None:
-        """Now and then, ask the whole map whether the vehicle is where the filter has it; if not, search all of it."""
+    def _look_around(
+        self, particles: ParticleFilter, predicted: Predicted, frame: int, measurement: Measurement
+    ) -> None:
+        """Now and then, ask the whole map whether the vehicle is where the filter has it; if not, search all of it.
+
+        The search begins with this scan, and so with the filter as it was before it.
+        """
         is_due = self._plan.phase is Phase.LOST or self._watch.is_due(self._travelled_m)
         if not (is_due and self._plan.follows_filter and self._prepare_whole_map(frame)):
             return
@@ -244,7 +251,8 @@ class FilterPass:
         if self._watch.record(self._travelled_m, contrast) > self._settings.lost_threshold:
             self._plan.give_up()
             self._note(frame, f"searching for {self._plan.phase.value}: this scan fits elsewhere")
-            self._update_anywhere(particles, frame, self._anywhere.match(measurement.points, particles), 1.0)
+            everywhere = self._anywhere.match(measurement.points, particles)
+            self._update_anywhere(predicted, frame, everywhere, 1.0)
 
     def _prepare_whole_map(self, frame: int) -> bool:
         """Have the map ready to be searched; when the matcher cannot, say so once and search about the filter."""

@@ -125,7 +125,7 @@ class StartCloud:
         box = self._prior.log_density(paths[0])
         proposals, target = [box], box.copy()
         for likelihood, drawn_from, poses in zip(self._likelihoods, self._drawn_from, paths, strict=True):
-            proposals.append(drawn_from.log_density(poses))
+            proposals.append(drawn_from.draw_log_density(poses))
             target += likelihood.with_outliers(self._outlier_probability).log_density(poses)
         weights = target - logsumexp(np.array(proposals), axis=0, b=self._shares()[:, None])
         return np.maximum(weights, np.max(weights) - 700.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +15,14 @@ from benchmarks.recovery_trials import auroc, right_after
 from fusion import se2
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
+from fusion.likelihood import PoseLikelihood
 from fusion.particle_filter import ParticleFilter
+from fusion.pose_filter import UpdateReport
 from fusion.prior import UniformPrior
 from fusion.two_level import TwoLevelLikelihood
 from learned.map_raster import MapRaster
 from learned.matcher import SearchRegion
-from sequences.anywhere import Candidates, GivenUp, map_box
+from sequences.anywhere import Candidates, GivenUp, Predicted, map_box
 from sequences.anywhere_search import AnywhereSearch
 from sequences.drive import load_drive
 from sequences.folder import FolderSequence
@@ -160,6 +163,31 @@ def test_a_place_that_was_just_found_is_doubted_for_the_share_of_the_others(
         assert doubt == others == pytest.approx(0.05, abs=0.03)
 
 
+def test_the_search_begins_with_the_filter_before_the_scan_that_gave_rise_to_it(
+    long_drive: MadeDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search weighs the poses with that scan itself; nothing of it may be in them."""
+    weighed: list[tuple[NDArray[np.float64], float]] = []
+    begun: list[tuple[Predicted, bool]] = []
+    update, search = ParticleFilter.update, AnywhereSearch.update
+
+    def updated(particles: ParticleFilter, likelihood: PoseLikelihood, temperature: float = 1.0) -> UpdateReport:
+        weighed.append((particles.particles, particles.lost_score))
+        return update(particles, likelihood, temperature)
+
+    def searched(anywhere: AnywhereSearch, predicted: Predicted | None, *rest: Any) -> ParticleFilter:
+        assert predicted is not None
+        begun.append((predicted, anywhere.is_running))
+        return search(anywhere, predicted, *rest)
+
+    monkeypatch.setattr(ParticleFilter, "update", updated)
+    monkeypatch.setattr(AnywhereSearch, "update", searched)
+    run(kidnapped(long_drive), long_drive, MapWideMatcher)
+    first, was_running = begun[0]
+    assert not was_running
+    assert any(np.array_equal(first.poses, poses) and first.lost_score == lost for poses, lost in weighed)
+
+
 def test_a_kidnapping_is_tracked_the_same_way_with_the_same_seed(recovered: RunResult, long_drive: MadeDrive) -> None:
     again = run(kidnapped(long_drive), long_drive, MapWideMatcher)
     np.testing.assert_array_equal(recovered.filter.poses, again.filter.poses)
@@ -266,7 +294,7 @@ def test_the_watch_needs_more_than_one_scan_that_fits_elsewhere_a_little() -> No
 def test_what_is_known_of_a_vehicle_that_was_given_up_is_a_density_that_it_is_drawn_from() -> None:
     grid = MapGrid(60, 80, 1.0, 0.0, 0.0)
     cloud = np.random.default_rng(0).normal([30.0, 20.0, 1.0], [1.0, 1.0, 0.1], (4000, 3))
-    known = GivenUp.by(ParticleFilter(cloud, 0), grid)
+    known = GivenUp.by(Predicted.of(ParticleFilter(cloud, 0)), grid)
     assert known.lost == 0.5
     poses = known.sample(200_000, np.random.default_rng(1))
     # Importance sampling of the volume of a box about the cloud: E[1 / density] over it is its volume.

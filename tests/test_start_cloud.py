@@ -88,3 +88,33 @@ def test_two_measurements_outvote_a_first_one_that_was_wrong() -> None:
     assert np.hypot(*(mean - truth)[:2]) < 0.5
     assert abs(se2.wrap(mean[2] - truth[2])) < 0.05
     assert np.sqrt(np.diag(covariance)).max() < 1.0
+
+
+def test_a_sharp_place_gets_the_share_of_what_the_likelihood_integrates_to() -> None:
+    """Poses are drawn from whole cells, and the density between them is interpolated: a sharp peak tells them apart."""
+    grid, bins = MapGrid(60, 60, 1.0, -30.0, -30.0), 72
+    x, y = grid.centres()
+    headings = np.arange(bins) * 2.0 * np.pi / bins
+
+    def place(east: float, sigma_m: float, sigma_rad: float) -> NDArray[np.float64]:
+        squared = ((x[None, :, None] - east) ** 2 + (y[:, None, None] - 0.5) ** 2) / sigma_m**2
+        density = np.exp(-0.5 * (squared + (se2.wrap(headings) / sigma_rad) ** 2))
+        return density / density.sum()
+
+    both = place(-15.5, 0.5, 0.052) + place(15.5, 3.0, 0.26)
+    likelihood = LikelihoodVolume.from_scores(np.log(both + 1e-13), grid)
+    prior = UniformPrior(np.zeros(3), 30.0, np.pi)
+    mixture, rng = likelihood.with_outliers(0.05), np.random.default_rng(1)
+
+    def mass(east: float, half_m: float, half_rad: float) -> float:
+        box = UniformPrior(np.array([east, 0.5, 0.0]), half_m, half_rad)
+        poses = box.sample(1_000_000, rng)
+        return float(np.exp(mixture.log_density(poses) - box.log_density(poses)).mean())
+
+    sharp, broad = mass(-15.5, 4.0, 0.5), mass(15.5, 14.0, 3.1)
+    cloud, log_weights = StartCloud(prior, 40_000, 0.05, np.random.default_rng(0)).add(likelihood, None)
+    weights = np.exp(log_weights - log_weights.max())
+    is_sharp = UniformPrior(np.array([-15.5, 0.5, 0.0]), 4.0, 0.5).contains(cloud)
+    is_broad = UniformPrior(np.array([15.5, 0.5, 0.0]), 14.0, 3.1).contains(cloud)
+    share = weights[is_sharp].sum() / weights[is_sharp | is_broad].sum()
+    assert share == pytest.approx(sharp / (sharp + broad), abs=0.01)  # by the interpolated density: 0.2 more
