@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from fusion import se2
 from fusion.arrays import FloatArray, checked
 from fusion.consistency import coverage, nees
+from fusion.error_correlation import estimate_error_correlation
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
 
 RECALL_THRESHOLDS = (1, 3, 5)
 """Metres for positions, degrees for headings."""
 _DIGITS = 6
+_CORRELATION_REACH_M = 40.0
 
 
 def vehicle_frame_errors(truth: NDArray[np.float64], estimate: NDArray[np.float64]) -> tuple[FloatArray, ...]:
@@ -149,6 +151,19 @@ def drift(truth: Trajectory, smoother: Trajectory, odometry: Trajectory) -> dict
         "last_quarter_mean_m": _rounded(errors[last].mean()),
         "odometry_final_error_m": _rounded(np.linalg.norm(final[:2] - truth.poses[-1, :2])),
     }
+
+
+def correlation_length(truth: NDArray[np.float64], single_shots: NDArray[np.float64]) -> float | None:
+    """Over how many metres (1/e) the errors of poses (N, 3) repeat, by `fusion.estimate_error_correlation`.
+
+    None where there are too few of them to say.
+    """
+    errors = np.column_stack(vehicle_frame_errors(truth, single_shots))
+    try:
+        found = estimate_error_correlation(errors, distance_along(truth), max_distance_m=_CORRELATION_REACH_M)
+    except SkyfixError:
+        return None
+    return _rounded(found.length_m)
 
 
 def after_first_quarter(truth: Trajectory, estimate: Trajectory) -> Trajectory:

@@ -10,7 +10,7 @@ from typing import Any
 
 from fusion.trajectory import Trajectory
 from sequences.filter_pass import STAGES
-from sequences.metrics import after_first_quarter, drift, summarise
+from sequences.metrics import after_first_quarter, correlation_length, drift, summarise
 from sequences.run_result import RunResult
 from sequences.sequence import odometry_is_emulated
 from sequences.start import prior_answers
@@ -32,7 +32,8 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
     Returns
     -------
     The methods `prior`, `odometry`, `single_shot` (measured frames only), `filter`, `filter_after_first_quarter` (of
-    the way) and `smoother`, as `metrics.summarise` describes them, and `drift`; none of these without ground truth.
+    the way) and `smoother`, as `metrics.summarise` describes them, `drift`, and `single_shot_correlation_length_m`,
+    None where too few scans were matched to say; none of these without ground truth.
     Always: what was run, and `seconds_per_frame` by stage, averaged over all frames.
     """
     methods = {} if result.truth is None else _methods(result, result.truth)
@@ -74,6 +75,8 @@ def _methods(result: RunResult, truth: Trajectory) -> dict[str, Any]:
     }
     methods: dict[str, Any] = {name: _summary(truth, trajectory) for name, trajectory in trajectories.items()}
     methods["drift"] = drift(truth, result.smoother, result.odometry)
+    shots = result.single_shot
+    methods["single_shot_correlation_length_m"] = correlation_length(truth.interpolate(shots.stamp_ns), shots.poses)
     return methods
 
 

@@ -83,6 +83,11 @@ def closing_lines(metrics: dict[str, Any]) -> list[str]:
     else:
         lines.append("no ground truth: errors are not known")
     lines.append(_calibration_line(OdometryCalibration(**metrics["odometry_calibration"])))
+    repeats_m = metrics.get("single_shot_correlation_length_m")
+    if repeats_m is not None:
+        lines.append(
+            f"single shots repeat an error over some {repeats_m:.1f} m: --correlation-length-m tells the filter"
+        )
     if metrics["skipped_frames"]:
         lines.append(f"{metrics['skipped_frames']} frames were due but could not be used: see frames.csv and log.txt")
     if metrics["scans_simulated"]:

@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 from fusion import se2
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
-from sequences.metrics import after_first_quarter, distance_along, drift, summarise, vehicle_frame_errors
+from sequences.metrics import (
+    after_first_quarter,
+    correlation_length,
+    distance_along,
+    drift,
+    summarise,
+    vehicle_frame_errors,
+)
 
 ANGLE = st.floats(-np.pi, np.pi)
 METRES = st.floats(-100.0, 100.0)
@@ -132,6 +139,24 @@ def test_drift_compares_quarters_of_the_way_and_frees_odometry_of_its_start() ->
     assert result["first_quarter_mean_m"] == pytest.approx(np.mean(np.arange(11)) / 10)
     assert result["last_quarter_mean_m"] == pytest.approx(np.mean(np.arange(30, 41)) / 10)
     assert result["odometry_final_error_m"] == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize("length_m", [4.0, 10.0])
+def test_the_length_over_which_single_shots_repeat_an_error_is_found(length_m: float) -> None:
+    """Errors of an Ornstein-Uhlenbeck process, one every 2 m of a curve, on the vehicle's axes; one in 20 is wild."""
+    rng, count = np.random.default_rng(0), 2000
+    repeated = np.exp(-2.0 / length_m)
+    noise = rng.normal(size=(count, 3)) * [1.0, 0.5, 0.02]
+    errors = noise.copy()
+    for i in range(1, count):
+        errors[i] = repeated * errors[i - 1] + np.sqrt(1.0 - repeated**2) * noise[i]
+    errors[::20, :2] += rng.uniform(-20.0, 20.0, (count // 20, 2))
+    truth = np.zeros((count, 3))
+    for i in range(1, count):
+        truth[i] = se2.compose(truth[i - 1], np.array([2.0, 0.0, 0.01]))
+    found = correlation_length(truth, se2.compose(truth, errors))
+    assert found == pytest.approx(length_m, rel=0.25)
+    assert correlation_length(truth[:10], truth[:10]) is None
 
 
 def test_the_first_quarter_is_one_of_the_way_not_of_the_time() -> None:
