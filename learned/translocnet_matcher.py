@@ -7,6 +7,7 @@ the network's `uniform_floor`.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -159,5 +160,5 @@ def _prior_yaw(search: SearchRegion) -> Tensor:
     return torch.tensor([float(search.centre[2])], dtype=torch.float64)
 
 
-ARCHITECTURE = Architecture("translocnet", TransLocNetSettings, TransLocNet, TransLocNetMatcher)
-COMPACT_ARCHITECTURE = Architecture("translocnet-compact", CompactSettings, TransLocNet, TransLocNetMatcher)
+ARCHITECTURE = Architecture("translocnet", TransLocNetSettings, TransLocNet, TransLocNetMatcher, needs_heading=True)
+COMPACT_ARCHITECTURE = replace(ARCHITECTURE, name="translocnet-compact", settings_type=CompactSettings)
