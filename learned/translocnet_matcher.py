@@ -33,7 +33,7 @@ from learned.voting import yaw_bins_within
 
 
 class TransLocNetMatcher:
-    """Implements `learned.network.NetworkMatcher`.
+    """Implements `learned.network.NetworkMatcher` and `learned.matcher.BoundedMatcher`.
 
     Parameters
     ----------
@@ -56,6 +56,11 @@ class TransLocNetMatcher:
     def error_correlation_length_m(self) -> float:
         """Distance over which errors decorrelate, metres."""
         return self.calibration.error_correlation_length_m
+
+    @property
+    def largest_half_extent_m(self) -> float:
+        """Half the side of the crop that the network sees, metres; see `learned.matcher.BoundedMatcher`."""
+        return self.net.settings.half_crop_m
 
     def match(
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
@@ -109,7 +114,7 @@ class TransLocNetMatcher:
     ) -> tuple[TransLocNetOutput, MapGrid]:
         """The network's answer, and the grid of its cells."""
         settings = self.net.settings
-        mpp, half = settings.bev.metres_per_pixel, settings.half_crop_m
+        mpp, half = settings.bev.metres_per_pixel, self.largest_half_extent_m
         if search.half_extent_m > half:
             raise SkyfixError(f"search: expected a half extent of at most {half:g} m, got {search.half_extent_m:g}")
         # The window's side is rounded up to a multiple of the crop's: ask for a little less than one.

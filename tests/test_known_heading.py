@@ -88,7 +88,7 @@ def test_translocnet_is_validated_calibrated_and_ablated_where_it_was_trained(
     config(COMPACT, tmp_path)
     ablation = tmp_path / "parts.yaml"
     ablation.write_text("base: tiny.yaml\nevaluation_samples: 2\nvariants: {full: {}}")
-    with pytest.raises(SkyfixError, match="--half-heading-deg: expected at most 12, what variant 'full' .*, got 180"):
+    with pytest.raises(SkyfixError, match=r"--half-heading-deg: expected at most 12, what variant 'full' .*, got 180"):
         ablate(ablation, tmp_path, tmp_path / "out", options=AblateOptions(half_headings_deg=(12.0, 180.0)))
     assert not (tmp_path / "out").exists()
     trues: list[NDArray[np.float64]] = []
