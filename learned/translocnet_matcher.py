@@ -40,7 +40,7 @@ class TransLocNetMatcher:
     net
         The network.
     calibration
-        Temperature and error correlation, from held-out data.
+        Temperature, heading concentration and error correlation, from held-out data.
     """
 
     def __init__(self, net: TransLocNet, calibration: Calibration | None = None) -> None:
@@ -82,16 +82,18 @@ class TransLocNetMatcher:
         output, grid = self._run(counts, map_raster, search)
         bins = yaw_bins_within(float(search.centre[2]), search.half_heading_rad, settings.yaw_bins)
         if isinstance(output.pose, DirectPose):
-            return self._gaussian_volume(output.pose, grid, search, bins)
-        maps = self._lazy_maps(output, output.pose, grid, search).within(search)
-        return maps.tempered(self.calibration.temperature).to_volume(bins, settings.uniform_floor)
+            volume = self._gaussian_volume(output.pose, grid, search, bins)
+        else:
+            maps = self._lazy_maps(output, output.pose, grid, search).within(search)
+            volume = maps.to_volume(bins, settings.uniform_floor)
+        return self.calibration.applied(volume)
 
     def likelihood(
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
     ) -> LazyPoseMaps:
         """Location over the whole crop, and the orientation where it is asked for; headings of the whole circle.
 
-        It is tempered by the calibration; a filter mixes the floor in by `with_outliers`.
+        It is calibrated; a filter mixes the floor in by `with_outliers`.
 
         Raises
         ------
@@ -101,7 +103,8 @@ class TransLocNetMatcher:
         output, grid = self._run(bev_counts(points, ground_z, self.net.settings.bev), map_raster, search)
         if isinstance(output.pose, DirectPose):
             raise SkyfixError("pose maps: expected a network with a probabilistic decoder, got direct regression")
-        return self._lazy_maps(output, output.pose, grid, search).tempered(self.calibration.temperature)
+        maps = self._lazy_maps(output, output.pose, grid, search).tempered(self.calibration.temperature)
+        return maps.with_heading_concentration(self.calibration.heading_concentration)
 
     def maps(
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
@@ -152,7 +155,7 @@ class TransLocNetMatcher:
         region = search_window(grid, search)
         x, y = region.centres()
         mesh = np.stack(np.meshgrid(y, x, np.array(bins) * step, indexing="ij"), axis=-1).reshape(-1, 3)
-        gaussian = GaussianLikelihood(mean, np.diag(sigma**2), region).tempered(self.calibration.temperature)
+        gaussian = GaussianLikelihood(mean, np.diag(sigma**2), region)
         values = gaussian.with_outliers(settings.uniform_floor).log_density(mesh[:, [1, 0, 2]])
         scores = np.zeros((region.rows, region.cols, settings.yaw_bins), dtype=np.float32)
         scores[:, :, bins] = values.reshape(region.rows, region.cols, len(bins))
@@ -165,5 +168,7 @@ def _prior_yaw(search: SearchRegion) -> Tensor:
     return torch.tensor([float(search.centre[2])], dtype=torch.float64)
 
 
-ARCHITECTURE = Architecture("translocnet", TransLocNetSettings, TransLocNet, TransLocNetMatcher, needs_heading=True)
+ARCHITECTURE = Architecture(
+    "translocnet", TransLocNetSettings, TransLocNet, TransLocNetMatcher, factored=True, needs_heading=True
+)
 COMPACT_ARCHITECTURE = replace(ARCHITECTURE, name="translocnet-compact", settings_type=CompactSettings)
