@@ -47,9 +47,10 @@ app.command(
 )(evaluate)
 app.command(
     epilog="Examples:\n\n"
-    "`skyfix train rotmatch.yaml --data osm --out runs/training`\n\n"
-    "`skyfix train rotmatch.yaml --data osm --set training.batch=16 --minutes 90 --cache samples`\n\n"
-    "`torchrun --nproc-per-node 2 -m sequences.cli train rotmatch.yaml --data osm`"
+    "`skyfix train learned/configs/hybrid.yaml --data osm --out runs/hybrid`\n\n"
+    "`skyfix train learned/weights/rotmatch_near.yaml --data osm --set training.batch=16 --minutes 90 "
+    "--cache samples`\n\n"
+    "`torchrun --nproc-per-node 2 -m sequences.cli train learned/configs/hybrid.yaml --data osm`"
 )(train)
 app.command(
     epilog="Examples:\n\n"
