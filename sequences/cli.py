@@ -15,6 +15,7 @@ import typer
 
 from fusion.errors import SkyfixError
 from sequences.cli_ablate import ablate
+from sequences.cli_emulate import emulate
 from sequences.cli_evaluate import evaluate
 from sequences.cli_options import JsonOption, PickleOption, SeedOption, write_json
 from sequences.cli_retrieve import retrieve
@@ -62,6 +63,11 @@ app.command(
     "`skyfix export rotmatch --out exported`\n\n"
     "`skyfix export runs/training/rotmatch.safetensors --out exported --int8 drives/kitti_13`"
 )(export)
+app.command(
+    epilog="Examples:\n\n"
+    "`skyfix emulate drives/kitti_00 --odometry sptam --measure-every-m 0`\n\n"
+    "`skyfix emulate drives/kitti_00 --odometry sptam --correlation 0.9 --markdown emulated.md`"
+)(emulate)
 app.command(epilog="Example: `skyfix retrieve drives/kitti_360 --index maps/karlsruhe.npz`")(retrieve)
 
 
