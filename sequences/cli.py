@@ -44,7 +44,8 @@ app.command(
     epilog="Examples:\n\n"
     "`skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`\n\n"
     "`skyfix evaluate drives/mine --matcher rotmatch --matcher runs/hybrid/hybrid.safetensors "
-    "--half-heading-deg 10 --half-heading-deg 180 --markdown table.md`"
+    "--half-heading-deg 10 --half-heading-deg 180 --markdown table.md`\n\n"
+    "`skyfix evaluate drives/kitti_360 --matcher exported --backend openvino-int8`"
 )(evaluate)
 app.command(
     epilog="Examples:\n\n"
