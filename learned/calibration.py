@@ -166,15 +166,19 @@ def with_heading_concentration(volume: LikelihoodVolume, concentration: float) -
     """
     if concentration == 1.0:
         return volume
-    evaluated = volume.log_prob > volume.floor
+    bins = np.flatnonzero(volume.bin_peaks > volume.floor)  # of many there are often few
+    searched = volume.log_prob[:, :, bins]
+    evaluated = searched > volume.floor
     width = np.log(se2.TWO_PI / volume.log_prob.shape[2])
-    log_prob = np.where(evaluated, volume.log_prob.astype(np.float64), -np.inf)
+    log_prob = np.where(evaluated, searched.astype(np.float64), -np.inf)
     position = logsumexp(log_prob, axis=2, keepdims=True) + width
     with np.errstate(invalid="ignore"):  # positions that were evaluated at no heading
         powered = concentration * (log_prob - position)
         powered += position - logsumexp(powered, axis=2, keepdims=True) - width
     floor = min(volume.floor, float(powered.min(where=evaluated, initial=np.inf)) - 1.0)
-    return LikelihoodVolume(np.where(evaluated, powered, floor).astype(np.float32), volume.grid, floor)
+    result = np.full_like(volume.log_prob, floor)
+    result[:, :, bins] = np.where(evaluated, powered, floor)
+    return LikelihoodVolume(result, volume.grid, floor)
 
 
 def fit_heading_concentration(

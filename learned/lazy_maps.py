@@ -194,6 +194,14 @@ class LazyPoseMaps:
         weight, bias = (parameter / np.float32(temperature) for parameter in (self.weight, self.bias))
         return replace(self, location=location.astype(np.float32), weight=weight, bias=bias)
 
+    def with_heading_concentration(self, concentration: float) -> LazyPoseMaps:
+        """The density of the heading at each position to a power, normalised again: the head is multiplied by it.
+
+        See `learned.calibration.with_heading_concentration`; the density of the position stays as it is.
+        """
+        weight, bias = (parameter * np.float32(concentration) for parameter in (self.weight, self.bias))
+        return replace(self, weight=weight, bias=bias)
+
     def with_outliers(self, probability: float) -> OutlierMixture:
         """Mix in the uniform density over the grid."""
         return OutlierMixture(self, probability)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,21 @@ class MapMatcher(Protocol):
             If the scan is empty or not finite, or the map lacks what the matcher needs.
         """
         ...
+
+
+@runtime_checkable
+class BoundedMatcher(Protocol):
+    """A `MapMatcher` that refuses searches of more than some extent: one whose network sees a crop of one size."""
+
+    @property
+    def largest_half_extent_m(self) -> float:
+        """Half the side of the largest square of positions that it searches, metres."""
+        ...
+
+
+def largest_half_extent_m(matcher: MapMatcher) -> float:
+    """Half the side of the largest square of positions that a matcher searches, metres; infinite where it says none."""
+    return matcher.largest_half_extent_m if isinstance(matcher, BoundedMatcher) else math.inf
 
 
 def matching_window(

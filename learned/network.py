@@ -183,6 +183,9 @@ class Architecture:
         Raised when weights of before no longer fit.
     factored
         Whether the heading is predicted apart from the position, so that its calibration gets a parameter of its own.
+    needs_heading
+        Whether the scan is turned by the heading known beforehand, so that it has to be known as well as in training;
+        others vote over all headings.
     """
 
     name: str
@@ -192,6 +195,7 @@ class Architecture:
     reaching: Callable[[Any, float], LocalizationNet] | None = None
     version: int = 1
     factored: bool = False
+    needs_heading: bool = False
 
     @property
     def tag(self) -> str:

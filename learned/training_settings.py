@@ -118,6 +118,16 @@ class TrainingSettings:
                 raise SkyfixError(f"training {name}: expected zero or more, got {value}")
         if self.ema_decay is not None and not 0.0 < self.ema_decay < 1.0:
             raise SkyfixError(f"training ema_decay: expected between 0 and 1, got {self.ema_decay}")
+        half_heading_deg = self.augmentation.half_heading_deg
+        if self.network.architecture.needs_heading and not 0.0 < half_heading_deg <= 180.0:
+            raise SkyfixError(
+                f"training augmentation.half_heading_deg: expected above 0 and at most 180, got {half_heading_deg}"
+            )
+
+    @property
+    def known_half_heading_deg(self) -> float:
+        """Within what the network is told the heading: 180 where it does without, else as it is trained, degrees."""
+        return self.augmentation.half_heading_deg if self.network.architecture.needs_heading else 180.0
 
     def rate(self, step: int) -> float:
         """Linear warm-up, then a cosine to zero, as a factor of the learning rate."""

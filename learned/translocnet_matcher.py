@@ -7,6 +7,7 @@ the network's `uniform_floor`.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -32,14 +33,14 @@ from learned.voting import yaw_bins_within
 
 
 class TransLocNetMatcher:
-    """Implements `learned.network.NetworkMatcher`.
+    """Implements `learned.network.NetworkMatcher` and `learned.matcher.BoundedMatcher`.
 
     Parameters
     ----------
     net
         The network.
     calibration
-        Temperature and error correlation, from held-out data.
+        Temperature, heading concentration and error correlation, from held-out data.
     """
 
     def __init__(self, net: TransLocNet, calibration: Calibration | None = None) -> None:
@@ -55,6 +56,11 @@ class TransLocNetMatcher:
     def error_correlation_length_m(self) -> float:
         """Distance over which errors decorrelate, metres."""
         return self.calibration.error_correlation_length_m
+
+    @property
+    def largest_half_extent_m(self) -> float:
+        """Half the side of the crop that the network sees, metres; see `learned.matcher.BoundedMatcher`."""
+        return self.net.settings.half_crop_m
 
     def match(
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
@@ -76,16 +82,18 @@ class TransLocNetMatcher:
         output, grid = self._run(counts, map_raster, search)
         bins = yaw_bins_within(float(search.centre[2]), search.half_heading_rad, settings.yaw_bins)
         if isinstance(output.pose, DirectPose):
-            return self._gaussian_volume(output.pose, grid, search, bins)
-        maps = self._lazy_maps(output, output.pose, grid, search).within(search)
-        return maps.tempered(self.calibration.temperature).to_volume(bins, settings.uniform_floor)
+            volume = self._gaussian_volume(output.pose, grid, search, bins)
+        else:
+            maps = self._lazy_maps(output, output.pose, grid, search).within(search)
+            volume = maps.to_volume(bins, settings.uniform_floor)
+        return self.calibration.applied(volume)
 
     def likelihood(
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
     ) -> LazyPoseMaps:
         """Location over the whole crop, and the orientation where it is asked for; headings of the whole circle.
 
-        It is tempered by the calibration; a filter mixes the floor in by `with_outliers`.
+        It is calibrated; a filter mixes the floor in by `with_outliers`.
 
         Raises
         ------
@@ -95,7 +103,8 @@ class TransLocNetMatcher:
         output, grid = self._run(bev_counts(points, ground_z, self.net.settings.bev), map_raster, search)
         if isinstance(output.pose, DirectPose):
             raise SkyfixError("pose maps: expected a network with a probabilistic decoder, got direct regression")
-        return self._lazy_maps(output, output.pose, grid, search).tempered(self.calibration.temperature)
+        maps = self._lazy_maps(output, output.pose, grid, search).tempered(self.calibration.temperature)
+        return maps.with_heading_concentration(self.calibration.heading_concentration)
 
     def maps(
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
@@ -108,7 +117,7 @@ class TransLocNetMatcher:
     ) -> tuple[TransLocNetOutput, MapGrid]:
         """The network's answer, and the grid of its cells."""
         settings = self.net.settings
-        mpp, half = settings.bev.metres_per_pixel, settings.half_crop_m
+        mpp, half = settings.bev.metres_per_pixel, self.largest_half_extent_m
         if search.half_extent_m > half:
             raise SkyfixError(f"search: expected a half extent of at most {half:g} m, got {search.half_extent_m:g}")
         # The window's side is rounded up to a multiple of the crop's: ask for a little less than one.
@@ -146,7 +155,7 @@ class TransLocNetMatcher:
         region = search_window(grid, search)
         x, y = region.centres()
         mesh = np.stack(np.meshgrid(y, x, np.array(bins) * step, indexing="ij"), axis=-1).reshape(-1, 3)
-        gaussian = GaussianLikelihood(mean, np.diag(sigma**2), region).tempered(self.calibration.temperature)
+        gaussian = GaussianLikelihood(mean, np.diag(sigma**2), region)
         values = gaussian.with_outliers(settings.uniform_floor).log_density(mesh[:, [1, 0, 2]])
         scores = np.zeros((region.rows, region.cols, settings.yaw_bins), dtype=np.float32)
         scores[:, :, bins] = values.reshape(region.rows, region.cols, len(bins))
@@ -159,5 +168,7 @@ def _prior_yaw(search: SearchRegion) -> Tensor:
     return torch.tensor([float(search.centre[2])], dtype=torch.float64)
 
 
-ARCHITECTURE = Architecture("translocnet", TransLocNetSettings, TransLocNet, TransLocNetMatcher)
-COMPACT_ARCHITECTURE = Architecture("translocnet-compact", CompactSettings, TransLocNet, TransLocNetMatcher)
+ARCHITECTURE = Architecture(
+    "translocnet", TransLocNetSettings, TransLocNet, TransLocNetMatcher, factored=True, needs_heading=True
+)
+COMPACT_ARCHITECTURE = replace(ARCHITECTURE, name="translocnet-compact", settings_type=CompactSettings)

@@ -47,7 +47,7 @@ class AblateOptions:
         "KEY.KEY=VALUE" each, changed in the base for all variants.
     half_extent_m, half_headings_deg, max_frames
         Starts of the single shots, see `sequences.shot_protocol`. Left out, the heading is known to within what the
-        base trains for.
+        base trains for; wider than a variant that needs the heading trains for is refused.
     """
 
     seeds: Sequence[int] = (0,)
@@ -150,6 +150,13 @@ class _Scores:
         own = read_config(ablation.base, options.overrides).training.augmentation.half_heading_deg
         headings = dict.fromkeys(options.half_headings_deg or (own,))
         self._protocols = [ShotProtocol(options.half_extent_m, each, options.max_frames) for each in headings]
+        for variant in ablation.variants:
+            known = variant.config.training.known_half_heading_deg
+            if max(headings) > known:
+                raise SkyfixError(
+                    f"--half-heading-deg: expected at most {known:g}, what variant {variant.name!r} is trained for, "
+                    f"got {max(headings):g}"
+                )
         self._held: tuple[Path, list[Sample]] | None = None
 
     def tasks(self, run: Run) -> list[Task]:

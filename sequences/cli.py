@@ -15,6 +15,7 @@ import typer
 
 from fusion.errors import SkyfixError
 from sequences.cli_ablate import ablate
+from sequences.cli_emulate import emulate
 from sequences.cli_evaluate import evaluate
 from sequences.cli_options import JsonOption, PickleOption, SeedOption, write_json
 from sequences.cli_retrieve import retrieve
@@ -43,13 +44,15 @@ app.command(
     epilog="Examples:\n\n"
     "`skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`\n\n"
     "`skyfix evaluate drives/mine --matcher rotmatch --matcher runs/hybrid/hybrid.safetensors "
-    "--half-heading-deg 10 --half-heading-deg 180 --markdown table.md`"
+    "--half-heading-deg 10 --half-heading-deg 180 --markdown table.md`\n\n"
+    "`skyfix evaluate drives/kitti_360 --matcher exported --backend openvino-int8`"
 )(evaluate)
 app.command(
     epilog="Examples:\n\n"
-    "`skyfix train rotmatch.yaml --data osm --out runs/training`\n\n"
-    "`skyfix train rotmatch.yaml --data osm --set training.batch=16 --minutes 90 --cache samples`\n\n"
-    "`torchrun --nproc-per-node 2 -m sequences.cli train rotmatch.yaml --data osm`"
+    "`skyfix train learned/configs/hybrid.yaml --data osm --out runs/hybrid`\n\n"
+    "`skyfix train learned/weights/rotmatch_near.yaml --data osm --set training.batch=16 --minutes 90 "
+    "--cache samples`\n\n"
+    "`torchrun --nproc-per-node 2 -m sequences.cli train learned/configs/hybrid.yaml --data osm`"
 )(train)
 app.command(
     epilog="Examples:\n\n"
@@ -61,6 +64,11 @@ app.command(
     "`skyfix export rotmatch --out exported`\n\n"
     "`skyfix export runs/training/rotmatch.safetensors --out exported --int8 drives/kitti_13`"
 )(export)
+app.command(
+    epilog="Examples:\n\n"
+    "`skyfix emulate drives/kitti_00 --odometry sptam --measure-every-m 0`\n\n"
+    "`skyfix emulate drives/kitti_00 --odometry sptam --correlation 0.9 --markdown emulated.md`"
+)(emulate)
 app.command(epilog="Example: `skyfix retrieve drives/kitti_360 --index maps/karlsruhe.npz --places places.csv`")(
     retrieve
 )

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sequences.cli_options import (
+    BackendOption,
     HalfExtentOption,
     HalfHeadingsOption,
     HeadingUnknownOption,
@@ -27,9 +28,12 @@ def evaluate(
     matcher: Annotated[
         list[str] | None,
         typer.Option(
-            help="As for track; give it several times to compare. Default: rotmatch and geometric.", metavar="NAME|FILE"
+            help="As for track; give it several times to compare. Default: rotmatch and geometric; with --backend "
+            "rotmatch.",
+            metavar="NAME|FILE",
         ),
     ] = None,
+    backend: BackendOption = None,
     half_extent: HalfExtentOption = 20.0,
     half_heading_deg: HalfHeadingsOption = None,
     heading_unknown: HeadingUnknownOption = False,
@@ -55,8 +59,10 @@ def evaluate(
 
     headings = list(half_heading_deg or ([] if heading_unknown else [10.0])) + ([180.0] if heading_unknown else [])
     protocols = [ShotProtocol(half_extent, heading, max_frames, seed) for heading in dict.fromkeys(headings)]
-    labels = matcher_labels(matcher or ["rotmatch", "geometric"])
-    loaded = {label: load_matcher(name) for label, name in labels.items()}
+    labels = matcher_labels(matcher or (["rotmatch", "geometric"] if backend is None else ["rotmatch"]))
+    if backend is not None:
+        labels = {f"{label} ({backend})": name for label, name in labels.items()}
+    loaded = {label: load_matcher(name, backend) for label, name in labels.items()}
     evaluations = []
     for path in sequences:
         opened = open_any(path, OpenOptions(seed, allow_pickle))

@@ -36,6 +36,15 @@ from sequences.metrics import summarise
 from sequences.offline import calibrate_drive, smooth_drive
 from sequences.start import offset_in_box
 
+_LABELS = {
+    "prior": "prior",
+    "odometry": "odometry only",
+    "single_shot": "single shot (emulated)",
+    "filter": "filter (of emulated measurements)",
+    "smoother": "drawn paths (of emulated measurements)",
+    "graph": "factor graph (of emulated measurements)",
+}
+"""Of the methods in tables."""
 _START_STREAM, _PRIOR_STREAM, _FILTER_STREAM, _MEASURE_STREAM, _SMOOTHER_STREAM = range(5)
 
 
@@ -132,7 +141,7 @@ class EmulatedRun:
         lines = [
             f"{self.name}: {len(self.measured)} emulated measurements",
             "",
-            "| method | mean m | median m | max m | heading mean ° | NEES / 3 | 95 % ellipse |",
+            "| method | mean m | median m | max m | heading mean ° | NEES / 3 | in the 95 % ellipse |",
             "|---|--:|--:|--:|--:|--:|--:|",
         ]
         for method, errors in self.metrics.items():
@@ -140,7 +149,7 @@ class EmulatedRun:
             cells = [f"{position[key]:.2f}" for key in ("mean", "median", "max")] + [f"{heading['mean']:.2f}"]
             known = "nees" in errors
             cells += [f"{errors['nees']['mean'] / 3:.2f}", f"{100 * errors['ellipse95']:.0f} %"] if known else ["", ""]
-            lines.append("| " + " | ".join([method, *cells]) + " |")
+            lines.append("| " + " | ".join([_LABELS[method], *cells]) + " |")
         return "\n".join(lines) + "\n"
 
 

@@ -16,7 +16,7 @@ from fusion.odometry import OdometryIncrement, accumulate
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from fusion.prior import UniformPrior
 from fusion.two_level import TwoLevelLikelihood
-from learned.matcher import MapMatcher
+from learned.matcher import MapMatcher, largest_half_extent_m
 from sequences.anywhere import Predicted
 from sequences.anywhere_search import AnywhereSearch
 from sequences.drive import Drive
@@ -58,6 +58,11 @@ class FilterPass:
         Odometry from each frame to the next.
     matcher, prior, settings
         The measurement model, the start, everything else.
+
+    Raises
+    ------
+    SkyfixError
+        If the start is larger than what the matcher searches, or is anywhere and it cannot search the whole map.
     """
 
     def __init__(
@@ -84,7 +89,13 @@ class FilterPass:
         self._since_measured: list[OdometryIncrement] = []
         self._rng = np.random.default_rng([settings.seed, _FILTER_STREAM])
         self._start_cloud = StartCloud(prior, settings.particles, settings.outlier_probability, self._rng)
-        self._plan = SearchPlan(prior, settings)
+        largest_m = largest_half_extent_m(matcher)
+        if prior.half_extent_m > largest_m and not settings.start_anywhere:
+            raise SkyfixError(
+                f"start: expected a half extent of at most {largest_m:g} m, the largest search of {matcher.name}, "
+                f"got {prior.half_extent_m:g}"
+            )
+        self._plan = SearchPlan(prior, settings, largest_m)
         self._watch = MapWatch(settings.map_check_every_m, drive.sequence.map.grid.area_m2)
         self._anywhere = AnywhereSearch(matcher, drive.sequence.map, drive.sequence.ground_z, settings, self._rng)
         if settings.start_anywhere:

@@ -11,6 +11,7 @@ it does not find again soon, or loses again soon, is looked for on the whole map
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
@@ -47,10 +48,12 @@ class SearchPlan:
         The start's box.
     settings
         Bounds, margins and how many measurements in a row settle something.
+    largest_half_extent_m
+        No search about the start or the prediction is larger than this; see `learned.matcher.BoundedMatcher`.
     """
 
-    def __init__(self, prior: UniformPrior, settings: TrackSettings) -> None:
-        self._prior, self._settings = prior, settings
+    def __init__(self, prior: UniformPrior, settings: TrackSettings, largest_half_extent_m: float = math.inf) -> None:
+        self._prior, self._settings, self._largest_m = prior, settings, largest_half_extent_m
         self._moved = np.zeros(3)  # odometry since the start, seen from the first body frame
         self._agreeing = self._disagreeing = 0
         self._lost_half_heading_rad = prior.half_heading_rad
@@ -75,11 +78,14 @@ class SearchPlan:
         if self.phase is Phase.START:
             start = self._start_carried_along()
             if prediction is None or start.half_extent_m <= self._widest_start_m:
-                return start
+                # A box that has outgrown the largest search is searched in part, which is still more than about a
+                # filter that has not settled.
+                return replace(start, half_extent_m=min(start.half_extent_m, self._largest_m))
             self.phase = Phase.LOST
         assert prediction is not None  # a filter exists after the first measurement
         sigma = self._settings.search_sigmas * np.sqrt(np.diag(prediction.covariance))
-        least_m, most_m = self._settings.search_min_half_extent_m, self._settings.search_max_half_extent_m
+        least_m = self._settings.search_min_half_extent_m
+        most_m = min(self._settings.search_max_half_extent_m, self._largest_m)
         least_rad = math.radians(self._settings.search_min_half_heading_deg)
         if self.phase is Phase.LOST:
             least_m, least_rad = most_m, max(least_rad, self._lost_half_heading_rad)

@@ -34,6 +34,7 @@ from sequences.figures.style import png_bytes
 from sequences.figures.validation import validation_figure
 from sequences.held_out import HELD_OUT_HALF_EXTENT_M, calibration_settings, validation_settings
 from sequences.osm import MapFeatures, read_osm
+from sequences.shot_scores import onto_evaluated
 from sequences.train_budget import steps_within
 from sequences.train_config import RESOLVED_FILE, TrainConfig, first_difference, read_config, write_config
 from sequences.training_data import SimulatedSamples
@@ -146,28 +147,37 @@ def train_from_config(
 
 
 def calibrated(
-    architecture: Architecture, net: Any, samples: list[Sample], figure: Path
+    architecture: Architecture, net: Any, samples: list[Sample], figure: Path, half_heading_deg: float
 ) -> tuple[Calibration, dict[str, float]]:
-    """Fit the calibration on held-out samples, heading unknown within +-20 m, and score single shots on them.
+    """Fit the calibration on held-out samples within +-20 m, and score single shots on them.
 
     How far the calibrated likelihoods may be believed is drawn into `figure`; it is of the samples that they were
     fitted on.
+
+    Parameters
+    ----------
+    architecture, net, samples, figure
+        The network, what it is asked about, and a PNG file to write.
+    half_heading_deg
+        Within what the heading is known: `TrainingSettings.known_half_heading_deg`.
     """
     matcher = architecture.matcher(net, Calibration())
-    volumes, truths = match_samples(matcher, samples, HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
-    calibration = fit_calibration(volumes, truths, architecture.factored)
+    volumes, truths = match_samples(matcher, samples, HELD_OUT_HALF_EXTENT_M, math.radians(half_heading_deg), seed=0)
+    scored = np.array([onto_evaluated(volume, truth) for volume, truth in zip(volumes, truths, strict=True)])
+    calibration = fit_calibration(volumes, scored, architecture.factored)
     ready = [calibration.applied(volume) for volume in volumes]
     best = np.array([volume.modes(1).means[0] for volume in ready])
     position = np.hypot(*(best - truths)[:, :2].T)
     heading = np.degrees(np.abs(se2.wrap(best[:, 2] - truths[:, 2])))
-    levels = [highest_density_level(volume, truth) for volume, truth in zip(ready, truths, strict=True)]
+    levels = [highest_density_level(volume, truth) for volume, truth in zip(ready, scored, strict=True)]
     chances = [calibration.confidence(volume) for volume in ready]
     confidence = reliability(chances, position < RIGHT_WITHIN_M, bins=5)
     covered = region_coverage(levels)
     figure.write_bytes(png_bytes(reliability_figure(confidence, np.array(levels))))
     metrics = {
         "samples": len(samples),
-        "nll": round(mean_nll(ready, truths, 1.0), 3),
+        "half_heading_deg": half_heading_deg,
+        "nll": round(mean_nll(ready, scored, 1.0), 3),
         "position_mean_m": round(float(position.mean()), 3),
         "position_median_m": round(float(np.median(position)), 3),
         "within_5_m": round(float((position < RIGHT_WITHIN_M).mean()), 3),
@@ -211,11 +221,12 @@ def _settled(
 
 def _validation_view(config: TrainConfig, validation: SimulatedSamples, folder: Path) -> ValidationView:
     """Draws the first held-out samples at every validation."""
+    half_heading_rad = math.radians(config.training.known_half_heading_deg)
 
     def view(step: int, net: LocalizationNet) -> None:
         matcher = config.training.network.architecture.matcher(on_cpu(net), Calibration())
         samples = [validation[index] for index in range(min(_PICTURES, len(validation)))]
-        volumes, truths = match_samples(matcher, samples, HELD_OUT_HALF_EXTENT_M, math.pi, seed=0)
+        volumes, truths = match_samples(matcher, samples, HELD_OUT_HALF_EXTENT_M, half_heading_rad, seed=0)
         folder.mkdir(exist_ok=True)
         for number, (sample, volume, truth) in enumerate(zip(samples, volumes, truths, strict=True)):
             density, best = log_density(sample.counts.astype(np.float32)), volume.modes(1).means[0]
@@ -245,7 +256,8 @@ def _finish(net: LocalizationNet, far: SimulatedSamples, config: TrainConfig, co
     if architecture.reaching is not None:
         net = architecture.reaching(net, config.matching_reach_m)
     samples = [far[i] for i in range(len(far))]
-    calibration, metrics = calibrated(architecture, net, samples, path.with_name("calibration.png"))
+    half_heading_deg = config.training.known_half_heading_deg
+    calibration, metrics = calibrated(architecture, net, samples, path.with_name("calibration.png"), half_heading_deg)
     provenance: dict[str, object] = {
         "command": command,
         "config": config.model_dump(mode="json"),

@@ -244,7 +244,7 @@ def test_evaluate_prints_the_prior_beside_every_matcher(
         "sharp": EmulatedMatcher(made_drive.truth.poses, sigma_m=0.3),
         "blunt": EmulatedMatcher(made_drive.truth.poses, sigma_m=3.0),
     }
-    monkeypatch.setattr(learned.matcher, "load_matcher", matchers.__getitem__)
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name, backend: matchers[name])
     made_drive.scan_file(0).write_bytes(b"")  # skipped, not fatal: every scan stands for itself
     arguments = ("evaluate", str(made_drive.path), "--matcher", "sharp", "--matcher", "blunt")
     done = skyfix(capsys, monkeypatch, *arguments, "--json", str(tmp_path / "shots.json"), "--max-frames", "15")
@@ -263,7 +263,7 @@ def test_evaluate_prints_the_prior_beside_every_matcher(
 def test_evaluate_takes_several_starts_in_one_call(
     made_drive: MadeDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learned.matcher, "load_matcher", lambda name: EmulatedMatcher(made_drive.truth.poses))
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda *_: EmulatedMatcher(made_drive.truth.poses))
     few = ("evaluate", str(made_drive.path), "--matcher", "one", "--max-frames", "3")
     table = tmp_path / "table.md"
     both = skyfix(
@@ -282,6 +282,39 @@ def test_evaluate_takes_several_starts_in_one_call(
         refused = skyfix(capsys, monkeypatch, *few, option, value)
         assert refused.code == 2
         assert refused.err == f"skyfix: error: {message}\n"
+
+
+def test_evaluate_hands_the_backend_on_and_names_it(
+    made_drive: MadeDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, str | None]] = []
+    load = learned.matcher.load_matcher
+
+    def seen(name: str, backend: str | None) -> EmulatedMatcher:
+        asked.append((name, backend))
+        return EmulatedMatcher(made_drive.truth.poses)
+
+    monkeypatch.setattr(learned.matcher, "load_matcher", seen)
+    few = ("evaluate", str(made_drive.path), "--max-frames", "2")
+    table = tmp_path / "table.md"
+    done = skyfix(capsys, monkeypatch, *few, "--backend", "openvino-int8", "--matcher", "out", "--markdown", str(table))
+    assert done.code == 0
+    assert [line.split("|")[3].strip() for line in done.out.splitlines()[2:]] == ["prior", "out (openvino-int8)"]
+    assert "- out (openvino-int8): `out`" in table.read_text()
+    assert skyfix(capsys, monkeypatch, *few, "--backend", "torch").code == 0
+    assert skyfix(capsys, monkeypatch, *few).code == 0
+    wanted = [("out", "openvino-int8"), ("rotmatch", "torch"), ("rotmatch", None), ("geometric", None)]
+    assert asked == wanted
+    monkeypatch.setattr(learned.matcher, "load_matcher", load)
+    for arguments, message in (
+        (("--backend", "tea"), "backend: expected torch or one of openvino, "),
+        (("--backend", "onnxruntime", "--matcher", "geometric"), "backend onnxruntime: expected rotmatch or a "),
+        (("--backend", "onnxruntime-int8"), "backend onnxruntime-int8: expected a folder of `skyfix export --int8`"),
+    ):
+        refused = skyfix(capsys, monkeypatch, *few, *arguments)
+        assert refused.code == 2
+        assert refused.err.startswith(f"skyfix: error: {message}")
+        assert refused.err.count("\n") == 1
 
 
 def test_demo_tracks_the_demo_sequence(

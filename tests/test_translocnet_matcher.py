@@ -104,11 +104,42 @@ def test_lazy_maps_and_maps_written_out_agree() -> None:
     poses = search.centre + np.random.default_rng(0).uniform(-1, 1, (50, 3)) * [4.0, 4.0, np.pi]
     shift = maps.log_density(poses) - lazy.log_density(poses)
     np.testing.assert_allclose(shift, shift[0], atol=1e-4)  # the density given the region
-    volume = matcher.match(scan_of(), -1.7, city(), SearchRegion(search.centre, 5.0))
-    floor = maps.with_outliers(TINY.uniform_floor)
+    raw = tiny_matcher()
+    volume = raw.match(scan_of(), -1.7, city(), SearchRegion(search.centre, 5.0))
+    floor = raw.maps(scan_of(), -1.7, city(), search).with_outliers(TINY.uniform_floor)
     x, y = maps.grid.centres()
     at_cells = np.array([[x[3], y[5], 10 * 2 * math.pi / 72], [x[12], y[15], 50 * 2 * math.pi / 72]])
     np.testing.assert_allclose(volume.log_density(at_cells), floor.log_density(at_cells), atol=1e-4)
+
+
+@pytest.mark.parametrize("probabilistic", [True, False])
+@pytest.mark.parametrize("half_heading_deg", [15.0, 180.0])
+def test_a_calibrated_answer_is_the_raw_one_calibrated(probabilistic: bool, half_heading_deg: float) -> None:
+    """What is fitted on raw likelihoods is what the matcher does to them."""
+    settings = replace(TINY, probabilistic=probabilistic)
+    assert ARCHITECTURES["translocnet"].factored
+    assert ARCHITECTURES["translocnet-compact"].factored
+    calibration = Calibration(temperature=1.4, heading_concentration=0.6)
+    search = SearchRegion(np.array([146.1, 8.3, -2.0]), 5.0, math.radians(half_heading_deg))
+    raw = tiny_matcher(settings).match(scan_of(), -1.7, city(), search)
+    ready = tiny_matcher(settings, calibration).match(scan_of(), -1.7, city(), search)
+    expected = calibration.applied(raw)
+    np.testing.assert_allclose(ready.log_prob, expected.log_prob, atol=1e-5)
+    assert (ready.grid, ready.floor) == (expected.grid, expected.floor)
+    tempered = Calibration(temperature=1.4).applied(raw)
+    assert np.abs(ready.log_prob - tempered.log_prob)[raw.log_prob > raw.floor].max() > 0.01
+
+
+def test_maps_give_the_headings_their_concentration() -> None:
+    """Over all headings, before any floor: the same as of the joint density written out."""
+    calibration = Calibration(temperature=1.4, heading_concentration=2.5)
+    search = SearchRegion(np.array([146.1, 8.3, -2.0]), 5.0)
+    ready = tiny_matcher(calibration=calibration).likelihood(scan_of(), -1.7, city(), search)
+    raw = tiny_matcher().likelihood(scan_of(), -1.7, city(), search)
+    everything = list(range(TINY.yaw_bins))
+    expected = calibration.applied(raw.to_volume(everything))
+    np.testing.assert_allclose(ready.to_volume(everything).log_prob, expected.log_prob, atol=2e-4)
+    np.testing.assert_array_equal(ready.location, raw.tempered(1.4).location)
 
 
 def test_nll_of_training_is_that_of_the_filters_likelihood() -> None:
