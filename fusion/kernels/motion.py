@@ -83,7 +83,7 @@ def regularise_in_clusters(start: int, n: int, labels: Int32s, clusters: Float32
 
 @numba.njit(**INLINED)
 def advance(n: int, motion: Float64s, s: Float32s) -> None:
-    """Compose a block with the increment and its noise, of which a heading that can exceed half a turn is wrapped first."""
+    """Compose a block with the increment and its noise; a heading's noise that can exceed half a turn is wrapped."""
     widest()
     dx, dy, dt = F(motion[0]), F(motion[1]), F(motion[2])
     r00, r10, r11 = F(motion[3]), F(motion[6]), F(motion[7])
