@@ -124,9 +124,9 @@ class Tracker:
         Raises
         ------
         SkyfixError
-            When the stamp is not an int64, the pose is not three finite numbers, or increments came before. What the filter
-            itself raises comes through; the tracker is then as before, without the odometry since the last step if the
-            filter cannot take that either.
+            When the stamp is not an int64, the pose is not three finite numbers, or increments came before.
+            What the filter itself raises comes through; the tracker is then as before, without the odometry since the
+            last step if the filter cannot take that either.
         """
         return self._take_odometry(checked_pose(stamp_ns, pose), is_increment=False)
 
@@ -239,7 +239,9 @@ class Tracker:
         tree = read_archive(path)
         try:
             return cls._from_tree(path, tree, pose_filter)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        except SkyfixError:
+            raise
+        except Exception as error:
             raise SkyfixError(f"{path}: expected a saved tracker, got one with parts missing or damaged") from error
 
     @classmethod

@@ -95,7 +95,7 @@ def test_what_only_the_next_step_can_refuse_is_given_up_then(kind):
     for i in range(5, 15):
         for one in (harmed, spared):
             one.add_increment(increment(START + 3 * SECOND + i * SECOND // 20))
-    np.testing.assert_array_equal(answers(harmed, ASKED), answers(spared, ASKED))
+    np.testing.assert_array_equal(answers(harmed, ASKED[2:]), answers(spared, ASKED[2:]))
 
 
 def test_a_first_increment_that_is_refused_does_not_decide_what_odometry_is():
