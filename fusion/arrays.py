@@ -1,6 +1,6 @@
 """Array types, and the check that every public function applies to the arrays it is given."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from types import EllipsisType
 from typing import Any
 
@@ -65,3 +65,14 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def keep_plain(settings: Any, names: Iterable[str]) -> None:
+    """Put Python's own numbers in place of numpy's in fields of a frozen dataclass, exactly.
+
+    A float32 would go on to round what it is multiplied by, and come back from a file as a float that does not.
+    """
+    for name in names:
+        value = getattr(settings, name)
+        if isinstance(value, np.generic):
+            object.__setattr__(settings, name, value.item())

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion import se2
-from fusion.arrays import FloatArray, checked
+from fusion.arrays import FloatArray, checked, keep_plain
 from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
@@ -40,6 +40,7 @@ class GaussianLikelihood:
     floor: float = DEFAULT_FLOOR
 
     def __post_init__(self) -> None:
+        keep_plain(self, ["floor"])
         mixture = self.modes(1)  # checks both
         if not np.isfinite(self.floor):
             raise SkyfixError(f"likelihood: expected a finite floor, got {self.floor}")

@@ -16,7 +16,7 @@ from math import ceil, floor, isfinite
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fusion.arrays import BoolArray, FloatArray, checked
+from fusion.arrays import BoolArray, FloatArray, checked, keep_plain
 from fusion.errors import SkyfixError
 
 _SNAP_TOLERANCE_PIXELS = 1e-3
@@ -48,6 +48,7 @@ class MapGrid:
     y0: float
 
     def __post_init__(self) -> None:
+        keep_plain(self, self.__slots__)
         if self.rows < 1 or self.cols < 1:
             raise SkyfixError(f"grid: expected at least 1 x 1 pixels, got {self.rows} x {self.cols}")
         if not (isfinite(self.metres_per_pixel) and self.metres_per_pixel > 0.0):

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from fusion import se2
-from fusion.arrays import FloatArray
+from fusion.arrays import FloatArray, keep_plain
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.fixed_lag import FixedLagSettings, FixedLagSmoother, LagCounts, LagReport, LagState
@@ -64,6 +64,7 @@ class HypothesisSettings:
     apart_distance: float = 2.0
 
     def __post_init__(self) -> None:
+        keep_plain(self, self.__slots__)
         if not 0.0 <= self.least_share < 1.0:
             raise SkyfixError(f"least_share: expected in [0, 1), got {self.least_share}")
         if not 0.0 < self.merge_distance <= self.apart_distance:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
 from fusion import se2
-from fusion.arrays import BoolArray, Float32Array, FloatArray, checked, read_only
+from fusion.arrays import BoolArray, Float32Array, FloatArray, checked, keep_plain, read_only
 from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
@@ -278,6 +278,7 @@ class OutlierMixture:
     probability: float
 
     def __post_init__(self) -> None:
+        keep_plain(self, ["probability"])
         if not 0.0 <= self.probability < 1.0:
             raise SkyfixError(f"outlier probability: expected in [0, 1), got {self.probability}")
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from fusion import se2
-from fusion.arrays import Float32Array, FloatArray, checked, read_only
+from fusion.arrays import Float32Array, FloatArray, checked, keep_plain, read_only
 from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
@@ -51,6 +51,7 @@ class LocationOrientationMaps:
     floor: float = DEFAULT_FLOOR
 
     def __post_init__(self) -> None:
+        keep_plain(self, ["confidence", "floor"])
         location = np.ascontiguousarray(self.location, dtype=np.float32)
         orientation = np.ascontiguousarray(self.orientation, dtype=np.float32)
         plan = (self.grid.rows, self.grid.cols)

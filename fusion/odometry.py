@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion import se2
-from fusion.arrays import FloatArray, checked, read_only
+from fusion.arrays import FloatArray, checked, keep_plain, read_only
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory, checked_stamps
 
@@ -87,6 +87,7 @@ class OdometryNoise:
     heading_rad_per_sqrt_s: float = 0.001
 
     def __post_init__(self) -> None:
+        keep_plain(self, self.__slots__)
         for entry in fields(self):
             value = getattr(self, entry.name)
             if not (np.isfinite(value) and value >= 0.0):

@@ -125,6 +125,8 @@ class Tracker:
         ------
         SkyfixError
             When the stamp is not an int64, the pose is not three finite numbers, or increments came before.
+            What the filter itself raises comes through; the tracker is then as before, without the odometry since the
+            last step if the filter cannot take that either.
         """
         return self._take_odometry(checked_pose(stamp_ns, pose), is_increment=False)
 
@@ -157,7 +159,8 @@ class Tracker:
         existing = self._timeline.likelihoods.get(stamp_ns)
         if existing is not None:
             return self._repeated(stamp_ns, is_same_likelihood(existing, likelihood))
-        progress = self._timeline.add_likelihood(stamp_ns, likelihood)
+        with self._timeline.unchanged_by_errors():
+            progress = self._timeline.add_likelihood(stamp_ns, likelihood)
         refusal = progress.refused.pop(stamp_ns, None)
         self._counts["rejected_likelihoods"] += len(progress.refused)
         if refusal is not None:
@@ -236,7 +239,9 @@ class Tracker:
         tree = read_archive(path)
         try:
             return cls._from_tree(path, tree, pose_filter)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        except SkyfixError:
+            raise
+        except Exception as error:
             raise SkyfixError(f"{path}: expected a saved tracker, got one with parts missing or damaged") from error
 
     @classmethod
@@ -260,17 +265,30 @@ class Tracker:
         if self._is_increments is (not is_increment):
             kinds = ("increments", "poses") if is_increment else ("poses", "increments")
             raise SkyfixError(f"odometry: expected {kinds[1]} as before, got {kinds[0]}")
+        counts, withheld = self._counts.copy(), self._guard.withheld
+        try:
+            with self._timeline.unchanged_by_errors():
+                arrival = self._placed(sample)
+        except BaseException:
+            counts["dismissed_odometry"] += withheld - self._guard.withheld + self._timeline.give_up_unusable()
+            self._counts = counts
+            raise
         self._is_increments = is_increment
+        return arrival
+
+    def _placed(self, sample: OdometrySample) -> Arrival:
         newest_ns = self._timeline.newest_ns
         if newest_ns is not None and sample.stamp_ns > newest_ns + self.settings.history_ns:
             return self._take_outside(sample, Side.AHEAD)
         if sample.stamp_ns <= self._timeline.horizon_ns:
             return self._take_outside(sample, Side.BEHIND)
-        self._counts["dismissed_odometry"] += self._guard.clear()
         existing = self._timeline.odometry.get(sample.stamp_ns)
         if existing is not None:
-            return self._repeated(sample.stamp_ns, existing.same_as(sample))
-        return self._use_odometry([sample], [])
+            arrival = self._repeated(sample.stamp_ns, existing.same_as(sample))
+        else:
+            arrival = self._use_odometry([sample], [])
+        self._counts["dismissed_odometry"] += self._guard.clear()
+        return arrival
 
     def _take_outside(self, sample: OdometrySample, side: Side) -> Arrival:
         """A sample from outside the window: alone it is nothing, in a long enough run it is a clock that jumped."""

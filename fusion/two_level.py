@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion import se2
-from fusion.arrays import Float32Array, FloatArray, IntArray, checked, read_only
+from fusion.arrays import Float32Array, FloatArray, IntArray, checked, keep_plain, read_only
 from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
@@ -63,6 +63,7 @@ class TwoLevelLikelihood:
     _place: NDArray[np.int32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        keep_plain(self, ["floor"])
         coarse = np.ascontiguousarray(self.coarse, np.float32)
         fine, cut = np.ascontiguousarray(self.fine, np.float32), np.ascontiguousarray(self.cut, np.int64)
         rows, cols = self.grid.rows, self.grid.cols

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.special import logsumexp, ndtr, ndtri
 
 from fusion import se2
-from fusion.arrays import FloatArray, checked, read_only
+from fusion.arrays import FloatArray, checked, keep_plain, read_only
 from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
@@ -72,6 +72,7 @@ class EmulatedLikelihood:
     log_partition: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        keep_plain(self, ["temperature", "floor"])
         answer = checked("answer", self.answer, (3,)).copy()
         answer[2] = se2.wrap(answer[2])
         weights = checked("weights", self.weights, ("C",))

@@ -31,6 +31,8 @@ intrinsic: Any = extending.intrinsic
 F = np.float32
 COPIES = 8
 """How many elements `put_copies` writes."""
+MOST_TURNS = 31
+"""How far from zero `within_a_turn` takes an angle."""
 LEAST_EXPONENT, GREATEST_EXPONENT = F(-87.0), F(88.0)
 _HALF, _ONE, _TWO = F(0.5), F(1.0), F(2.0)
 _SQRT_HALF_BITS, _MANTISSA_BITS, _EXPONENT_BIAS = np.int32(0x3F3504F3), np.int32(23), np.int32(127)
@@ -227,3 +229,13 @@ def wrap(angle: np.float32) -> np.float32:
     """An angle in (-3 pi, 3 pi) wrapped to [-pi, pi), to float32's rounding."""
     angle = angle - (F(6.2831855) if angle >= F(3.1415925) else F(0.0))
     return angle + (F(6.2831855) if angle < F(-3.1415927) else F(0.0))
+
+
+@numba.njit(**INLINED)
+def within_a_turn(angle: np.float32) -> np.float32:
+    """An angle of at most `MOST_TURNS` turns less whole turns: in [-pi, pi], to float32's rounding of it as it came.
+
+    What lies there already comes back as it is.
+    """
+    turns = np.int32(angle * F(0.15915494) + F(MOST_TURNS + 0.5)) - np.int32(MOST_TURNS)  # rounded: never negative
+    return angle - F(turns) * F(6.2831855)

@@ -4,9 +4,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.kernels.float_math import INLINED, F, get, put, sine_cosine, take, widest, wrap
+from fusion.kernels.float_math import INLINED, F, get, put, sine_cosine, take, widest, within_a_turn, wrap
 from fusion.kernels.layout import BLOCK, CLUSTER_SIZE, E0, E1, E2, E3, E4, E5, Float32s, Float64s, Int32s, T, X, Y
 from fusion.kernels.random import U, normal_pair, threefry
+
+_WIDE = F(0.1)  # rad^2: normals of 5.8 standard deviations on two axes stay below half a turn for a lesser variance
 
 
 @numba.njit(**INLINED)
@@ -81,12 +83,16 @@ def regularise_in_clusters(start: int, n: int, labels: Int32s, clusters: Float32
 
 @numba.njit(**INLINED)
 def advance(n: int, motion: Float64s, s: Float32s) -> None:
-    """Compose a block with the increment and its noise."""
+    """Compose a block with the increment and its noise; a heading's noise that can exceed half a turn is wrapped."""
     widest()
     dx, dy, dt = F(motion[0]), F(motion[1]), F(motion[2])
     r00, r10, r11 = F(motion[3]), F(motion[6]), F(motion[7])
     r20, r21, r22 = F(motion[9]), F(motion[10]), F(motion[11])
     sx, sy = F(motion[12]), F(motion[13])
+    if r20 * r20 + r21 * r21 + r22 * r22 > _WIDE:
+        for j in range(n):
+            s[E2 + j] = within_a_turn(r20 * s[E0 + j] + r21 * s[E1 + j] + r22 * s[E2 + j])
+        r20, r21, r22 = F(0), F(0), F(1)
     for j in range(n):
         e0, e1, e2 = s[E0 + j], s[E1 + j], s[E2 + j]
         yaw = s[T + j]

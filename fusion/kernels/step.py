@@ -2,10 +2,10 @@
 
 A cloud is kept as float32 x, y, yaw in three arrays (a 3 x N matrix), positions relative to an anchor near the cloud,
 so that a position within 64 m of it is exact to 4 micrometres. A block is 512 particles. Every block reads its
-particles through the ancestors that resampling has chosen, adds kernel noise and motion noise from a counter-based
-generator, interpolates the log density of a `Lookup`, updates the log weights and sums the moments. Blocks do not
-share anything, and their sums are added in a fixed order, so threads can take any range of blocks and the result
-is the same bit for bit.
+particles through the ancestors that resampling has chosen, adds kernel noise and motion noise, however wide, from a
+counter-based generator, interpolates the log density of a `Lookup`, updates the log weights and sums the moments.
+Blocks do not share anything, and their sums are added in a fixed order, so threads can take any range of blocks and the
+result is the same bit for bit.
 
 Source of the layout: counter-based noise and blocks after Salmon et al. 2011 and the usual practice of tiling; the
 sums are a streaming log-sum-exp with one maximum a block.

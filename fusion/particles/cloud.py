@@ -18,7 +18,7 @@ from fusion.kernels.moments import arc_blocks, combined
 from fusion.kernels.step import step_blocks
 from fusion.particles.arrangement import arrange, is_spread_out
 from fusion.particles.lookup import NO_TABLE, NO_TABLES, Lookup
-from fusion.particles.moments import Moments, lower_root, wrapped
+from fusion.particles.moments import Moments, lower_root, motion_root, wrapped
 from fusion.particles.regularisation import cluster_kernels, silverman_bandwidth
 from fusion.particles.shared_work import find_ancestors, share
 
@@ -132,7 +132,7 @@ class Cloud:
             self._settle()
         motion = self._order()
         motion[at.DELTA : at.DELTA + 3] = delta
-        motion[at.ROOT : at.ROOT + 9] = lower_root(covariance)
+        motion[at.ROOT : at.ROOT + 9] = motion_root(covariance)
         motion[at.MOVED] = 1.0
         self._moments = None
 

@@ -17,7 +17,7 @@ from statistics import NormalDist
 import numpy as np
 
 from fusion import se2
-from fusion.arrays import FloatArray
+from fusion.arrays import FloatArray, keep_plain
 from fusion.errors import SkyfixError
 
 
@@ -50,6 +50,7 @@ class KldSampling:
     cell_rad: float = float(np.deg2rad(5.0))
 
     def __post_init__(self) -> None:
+        keep_plain(self, self.__slots__)
         if not 1 <= self.least <= self.most:
             raise SkyfixError(f"adaptive: expected 1 <= least <= most, got {self.least} and {self.most}")
         if not 0.5 < self.confidence < 1.0:

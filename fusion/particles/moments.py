@@ -9,6 +9,7 @@ from fusion.arrays import FloatArray
 from fusion.particles.clusters import VARIANCE_FLOOR
 
 _ROUNDING = 1e-14
+_TURN = 2.0 * pi
 _FLOOR_M2, _FLOOR_RAD2 = float(VARIANCE_FLOOR[0, 0]), float(VARIANCE_FLOOR[2, 2])
 
 
@@ -40,6 +41,18 @@ def lower_root(covariance: list[list[float]]) -> list[float]:
     e = (yt - b * c) / d if d > 0.0 else 0.0
     rest = tt - c * c - e * e
     return [a, 0.0, 0.0, b, d, 0.0, c, e, sqrt(rest) if rest > _ROUNDING * tt else 0.0]
+
+
+def motion_root(covariance: list[list[float]]) -> list[float]:
+    """As `lower_root`, for noise of a motion whose heading is wrapped: at most a turn of standard deviation.
+
+    A normal heading of one turn is uniform on the circle but for ``2 exp(-2 pi^2) = 5e-9`` of its density, less than
+    float32 resolves, and a wider one is the same. Correlations stay as they are.
+    """
+    root, deviation = lower_root(covariance), sqrt(max(covariance[2][2], 0.0))
+    if deviation > _TURN:
+        root[6:] = [value * (_TURN / deviation) for value in root[6:]]
+    return root
 
 
 def positive_definite(covariance: list[list[float]], factor: float) -> FloatArray:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from math import isfinite
 
+from fusion.arrays import keep_plain
 from fusion.errors import SkyfixError
 from fusion.particles.kld_sampling import KldSampling
 from fusion.particles.lost import LostModel
@@ -66,6 +67,7 @@ class ParticleFilterSettings:
     threads: int = 1
 
     def __post_init__(self) -> None:
+        keep_plain(self, self.__slots__)
         if self.resampler not in RESAMPLERS:
             raise SkyfixError(f"resampler: expected one of {', '.join(RESAMPLERS)}, got {self.resampler!r}")
         for name in ("ess_fraction", "regularisation"):

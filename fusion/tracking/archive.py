@@ -8,7 +8,9 @@ that they read back bit for bit.
 import json
 import os
 import zipfile
+from contextlib import suppress
 from pathlib import Path
+from threading import get_ident
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -30,11 +32,11 @@ def write_archive(path: str | Path, tree: Tree) -> None:
     SkyfixError
         When the file cannot be written.
     """
-    path = Path(path)
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps(_packed(tree, arrays, {}), allow_nan=False)
     arrays[_JSON] = np.frombuffer(text.encode(), dtype=np.uint8)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    path = Path(path)
+    draft = path.parent / f".skyfix-{os.getpid()}-{get_ident()}"  # of a length that is allowed wherever the path's is
     try:
         with zipfile.ZipFile(draft, "w") as archive:
             for name, array in arrays.items():
@@ -42,9 +44,12 @@ def write_archive(path: str | Path, tree: Tree) -> None:
                 with archive.open(undated, "w", force_zip64=True) as entry:
                     np.lib.format.write_array(entry, array, allow_pickle=False)
         draft.replace(path)
-    except OSError as error:
-        draft.unlink(missing_ok=True)
-        raise SkyfixError(f"{path}: expected a file that can be written, got {error.strerror}") from error
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise SkyfixError(f"{path}: expected a file that can be written, got {reason}") from error
+    finally:
+        with suppress(OSError, ValueError):
+            draft.unlink(missing_ok=True)
 
 
 def read_archive(path: str | Path) -> Any:
@@ -60,8 +65,22 @@ def read_archive(path: str | Path) -> Any:
             return _unpacked(json.loads(arrays[_JSON].tobytes().decode()), arrays, {})
     except OSError as error:
         raise SkyfixError(f"{path}: expected a saved file, got {error.strerror or error}") from error
-    except (ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+    except Exception as error:  # of damaged bytes the readers of zip, npy and JSON make errors of any type
         raise SkyfixError(f"{path}: expected a saved file, got something else or a damaged one") from error
+
+
+def plain(value: Any) -> Any:
+    """A number, string or None of Python's own, exactly, in place of one of numpy's.
+
+    Raises
+    ------
+    SkyfixError
+        When it is of another type.
+    """
+    python = value.item() if isinstance(value, np.generic) else value
+    if python is not None and not isinstance(python, bool | int | float | str):
+        raise SkyfixError(f"archive: expected numbers, strings, lists and arrays, got {type(value).__name__}")
+    return python
 
 
 def _packed(tree: Tree, arrays: dict[str, NDArray[Any]], names: dict[Any, str]) -> Any:
@@ -77,9 +96,9 @@ def _packed(tree: Tree, arrays: dict[str, NDArray[Any]], names: dict[Any, str]) 
         if _ARRAY in tree:
             raise SkyfixError(f"archive: expected keys other than {_ARRAY}, got it")
         return {key: _packed(value, arrays, names) for key, value in tree.items()}
-    if isinstance(tree, list):
+    if isinstance(tree, list | tuple):
         return [_packed(value, arrays, names) for value in tree]
-    return tree
+    return plain(tree)
 
 
 def _unpacked(packed: Any, arrays: Any, known: dict[str, NDArray[Any]]) -> Any:

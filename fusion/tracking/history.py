@@ -53,6 +53,10 @@ class History:
     def __len__(self) -> int:
         return len(self._nodes)
 
+    def copy(self) -> "History":
+        """One of its own with the same nodes."""
+        return History(self._nodes)
+
     @property
     def base(self) -> Node:
         """The oldest node."""

@@ -18,6 +18,12 @@ class LikelihoodBuffer:
     def __len__(self) -> int:
         return len(self._stamps)
 
+    def copy(self) -> Self:
+        """One of its own with the same likelihoods."""
+        other = type(self)()
+        other._stamps, other._by_arrival = self._stamps.copy(), self._by_arrival.copy()
+        return other
+
     def get(self, stamp_ns: int) -> PoseLikelihood | None:
         """The likelihood with exactly this stamp."""
         return self._by_arrival.get(stamp_ns)

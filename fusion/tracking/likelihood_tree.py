@@ -5,18 +5,25 @@ from typing import Any
 
 import numpy as np
 
+from fusion.emulation.emulated_likelihood import EmulatedLikelihood
 from fusion.errors import SkyfixError
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.grid import MapGrid
+from fusion.lazy_orientation import LazyOrientation
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
 from fusion.location_orientation import LocationOrientationMaps
-from fusion.tracking.archive import Tree
+from fusion.tracking.archive import Tree, plain
+from fusion.two_level import TwoLevelLikelihood
 
 _FIELDS: dict[type, tuple[str, ...]] = {
     GaussianLikelihood: ("mean", "covariance", "floor"),
     LikelihoodVolume: ("log_prob", "floor"),
     LocationOrientationMaps: ("location", "orientation", "confidence", "floor"),
+    LazyOrientation: ("location", "features", "weights", "bias", "floor"),
+    TwoLevelLikelihood: ("coarse", "cut", "fine", "floor"),
+    EmulatedLikelihood: ("answer", "half_box", "weights", "centres", "sigmas", "halves", "temperature", "floor"),
 }
+_WITHOUT_GRID = (EmulatedLikelihood,)  # its grid follows from the rest
 
 
 def likelihood_tree(likelihood: PoseLikelihood) -> dict[str, Tree]:
@@ -35,7 +42,8 @@ def likelihood_tree(likelihood: PoseLikelihood) -> dict[str, Tree]:
         known = ", ".join(kind.__name__ for kind in [*_FIELDS, OutlierMixture])
         raise SkyfixError(f"likelihood: expected one of {known} to write, got {type(likelihood).__name__}")
     values: dict[str, Tree] = {name: getattr(likelihood, name) for name in names}
-    return {"type": type(likelihood).__name__, "grid": asdict(likelihood.grid), **values}
+    grid: dict[str, Tree] = {} if type(likelihood) in _WITHOUT_GRID else {"grid": asdict(likelihood.grid)}
+    return {"type": type(likelihood).__name__, **grid, **values}
 
 
 def likelihood_from_tree(tree: Any) -> PoseLikelihood:
@@ -45,7 +53,10 @@ def likelihood_from_tree(tree: Any) -> PoseLikelihood:
     if name == "OutlierMixture":
         return OutlierMixture(likelihood_from_tree(fields["likelihood"]), fields["probability"])
     kind = {known.__name__: known for known in _FIELDS}[name]
-    return kind(**{**fields, "grid": MapGrid(**fields["grid"])})
+    if "grid" in fields:
+        fields["grid"] = MapGrid(**fields["grid"])
+    likelihood: PoseLikelihood = kind(**fields)
+    return likelihood
 
 
 def is_same_likelihood(a: PoseLikelihood, b: PoseLikelihood) -> bool:
@@ -63,4 +74,7 @@ def _is_same(a: Tree, b: Tree) -> bool:
         return np.array_equal(a, b)
     if isinstance(a, dict) and isinstance(b, dict):
         return a.keys() == b.keys() and all(_is_same(value, b[key]) for key, value in a.items())
+    if isinstance(a, np.ndarray | dict) or isinstance(b, np.ndarray | dict):
+        return False
+    a, b = plain(a), plain(b)
     return type(a) is type(b) and bool(a == b)

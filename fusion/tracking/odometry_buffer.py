@@ -68,6 +68,14 @@ class OdometryBuffer:
     def __len__(self) -> int:
         return len(self._stamps)
 
+    def copy(self) -> Self:
+        """One of its own with the same samples."""
+        other = type(self)(self._noise, self._limits, self._entry)
+        other.kind_counts = self.kind_counts.copy()
+        other._stamps, other._samples = self._stamps.copy(), self._samples.copy()
+        other._deltas, other._kinds = self._deltas.copy(), self._kinds.copy()
+        return other
+
     @property
     def first_ns(self) -> int:
         """Oldest stamp held."""
@@ -159,6 +167,14 @@ class OdometryBuffer:
         if count > 0:
             del self._stamps[:count], self._samples[:count], self._deltas[:count], self._kinds[:count]
             self._entry = None
+
+    def forget_after(self, stamp_ns: int) -> int:
+        """Drop the samples that motions up to a covered stamp do not need, and say how many."""
+        first = bisect_left(self._stamps, stamp_ns) + 1
+        self.kind_counts.subtract(self._kinds[first:])
+        count = max(0, len(self) - first)
+        del self._stamps[first:], self._samples[first:], self._deltas[first:], self._kinds[first:]
+        return count
 
     def to_tree(self) -> Tree:
         """Everything, for a file."""

@@ -18,7 +18,7 @@ from enum import StrEnum
 import numpy as np
 
 from fusion import se2
-from fusion.arrays import FloatArray
+from fusion.arrays import FloatArray, keep_plain
 from fusion.errors import SkyfixError
 
 _SLACK_M = 0.5  # of a possible motion: position noise and stamps that jitter, whatever the time between two samples
@@ -65,6 +65,7 @@ class OdometryLimits:
     gap_heading_rad_per_sqrt_s: float = 0.05
 
     def __post_init__(self) -> None:
+        keep_plain(self, self.__slots__)
         for entry in fields(self):
             value = getattr(self, entry.name)
             if not (np.isfinite(value) and value > 0.0):

@@ -7,6 +7,7 @@ snapshot before it, with the result that it would have had in time.
 """
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -67,6 +68,31 @@ class Timeline:
     def horizon_ns(self) -> int:
         """What has this stamp or an older one comes too late."""
         return BEGINNING if self.newest_ns is None else max(BEGINNING, self.newest_ns - self._settings.history_ns)
+
+    @contextmanager
+    def unchanged_by_errors(self) -> Iterator[None]:
+        """What is done to the timeline within and then raises has not been done."""
+        kept = self.odometry.copy(), self.likelihoods.copy(), self.history.copy()
+        try:
+            yield
+        except BaseException:
+            self.odometry, self.likelihoods, self.history = kept
+            self.filter.restore(self.history.head.state)
+            raise
+
+    def give_up_unusable(self) -> int:
+        """Drop the odometry that waits for the next step if the filter cannot take it; says how many samples."""
+        head, newest_ns = self.history.head, self.newest_ns
+        if newest_ns is None or newest_ns <= head.stamp_ns:
+            return 0
+        try:
+            self._move(head, newest_ns, newest_ns)
+            self.filter.state()
+        except Exception:
+            return self.odometry.forget_after(head.stamp_ns)
+        finally:
+            self.filter.restore(head.state)
+        return 0
 
     def add_odometry(self, sample: OdometrySample) -> Progress:
         """Take in a sample with a new stamp after the horizon."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from fusion.arrays import keep_plain
 from fusion.errors import SkyfixError
 from fusion.odometry import OdometryNoise
 from fusion.tracking.archive import Tree
@@ -49,6 +50,7 @@ class TrackerSettings:
     limits: OdometryLimits = field(default_factory=OdometryLimits)
 
     def __post_init__(self) -> None:
+        keep_plain(self, self.__slots__)
         for name in ("history_s", "step_s"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 1e-6):
