@@ -6,9 +6,19 @@ The orientation head of a network is a (K, C) matrix applied to the C features o
     p(yaw | pixel) = softmax over K of (W f(pixel) + b) * K / (2 pi)
 
 is evaluated for the pixels around the poses that are asked about, and for no others.
+
+Tempered, p(x, y) p(yaw | x, y) to the power q = 1 / T has the normaliser
+
+    Z = sum over pixels of p(x, y)^q S(x, y) * pixel area,    S = integral of p(yaw | x, y)^q
+
+which asks for the headings wherever there is mass. S is at most (2 pi)^(1 - q) for q < 1, by Jensen's inequality, and
+at most (K / 2 pi)^(q - 1) otherwise. So pixels are summed from the likeliest on, and no more once all that are left
+cannot change Z by a millionth. Where a location map is peaked that is a few of them; one with a broad background at a
+high temperature has its mass everywhere, and is then summed everywhere, once, a block of pixels at a time.
 """
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,9 +29,12 @@ from fusion.arrays import Float32Array, FloatArray, IntArray, checked, read_only
 from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
-from fusion.likelihood import DEFAULT_FLOOR, OutlierMixture
+from fusion.likelihood import DEFAULT_FLOOR, OutlierMixture, checked_temperature
 from fusion.location_orientation import LocationOrientationMaps
 from fusion.particles.lookup import MOST_CELLS, Lookup
+
+_NEGLIGIBLE = 1e-6  # share of the mass that is left out of a normaliser: float32 holds no less
+_BLOCK = 256  # pixels whose headings are worked out at once for it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +56,13 @@ class LazyOrientation:
     floor : float
         ln density per m^2 rad outside the crop, and the least inside it.
 
+    Attributes
+    ----------
+    temperature : float
+        The density is the joint one above to the power 1 / temperature, normalised again; 1 but for :meth:`tempered`.
+    log_partition : float
+        ln of the integral of that power.
+
     Raises
     ------
     SkyfixError
@@ -55,6 +75,10 @@ class LazyOrientation:
     bias: Float32Array
     grid: MapGrid
     floor: float = DEFAULT_FLOOR
+    temperature: float = field(init=False, default=1.0)
+    log_partition: float = field(init=False, default=0.0, repr=False)
+    _drawn_pixels: IntArray = field(init=False, repr=False)
+    _drawn_log_mass: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         plan = (self.grid.rows, self.grid.cols)
@@ -68,6 +92,8 @@ class LazyOrientation:
             raise SkyfixError(f"weights: expected {expected} for the bias and the features, got {self.weights.shape}")
         if not np.isfinite(self.floor):
             raise SkyfixError(f"likelihood: expected a finite floor, got {self.floor}")
+        object.__setattr__(self, "_drawn_pixels", np.arange(self.location.size))
+        object.__setattr__(self, "_drawn_log_mass", self.location.reshape(-1).astype(np.float64))
 
     @property
     def searched_volume(self) -> float:
@@ -75,13 +101,17 @@ class LazyOrientation:
         return self.grid.area_m2 * se2.TWO_PI
 
     def headings_at(self, pixels: IntArray) -> Float32Array:
-        """ln density per rad (M, K) of the headings at flat pixels (M,)."""
+        """ln density per rad (M, K) of the headings at flat pixels (M,), at temperature 1."""
         logits = self.features.reshape(len(self.features), -1)[:, pixels].T @ self.weights.T + self.bias
         normaliser = logsumexp(logits, axis=1, keepdims=True) + np.log(se2.TWO_PI / len(self.bias))
         return np.ascontiguousarray(logits - normaliser, dtype=np.float32)
 
-    def lookup_near(self, poses: FloatArray) -> Lookup | None:
-        """What the compiled filter step reads, with headings only at the pixels around poses (N, 3)."""
+    def lookup_near(self, poses: FloatArray, temperature: float = 1.0) -> Lookup | None:
+        """What the compiled filter step reads of :meth:`tempered`, with headings only around poses (N, 3).
+
+        None when that is too many cells.
+        """
+        whole = self.tempered(temperature)
         pixels = self._touched(poses)
         if len(pixels) * len(self.bias) > MOST_CELLS:
             return None
@@ -89,7 +119,8 @@ class LazyOrientation:
         slots[pixels] = np.arange(len(pixels), dtype=np.int32)
         table, bins = self.headings_at(pixels).reshape(-1), len(self.bias)
         location = self.location.reshape(-1)
-        return Lookup(table, self.grid, bins, 1.0, 0.0, self.floor, self.floor, location, slots, bins, 1)
+        scale, shift = 1.0 / whole.temperature, 0.0 - whole.log_partition
+        return Lookup(table, self.grid, bins, scale, shift, self.floor, self.floor, location, slots, bins, 1)
 
     def log_density(self, poses: ArrayLike) -> FloatArray:
         """Trilinear interpolation of the joint log density at poses (N, 3), as `LocationOrientationMaps` does it."""
@@ -105,16 +136,19 @@ class LazyOrientation:
         step = self.grid.metres_per_pixel
         y0 = self.grid.y0 + (self.grid.rows - bottom) * step
         window = MapGrid(bottom - top, right - left, step, self.grid.x0 + left * step, y0)
-        near = LocationOrientationMaps(self.location[top:bottom, left:right], headings, window, floor=self.floor)
+        location = self.location[top:bottom, left:right] / self.temperature - self.log_partition
+        near = LocationOrientationMaps(location, headings / self.temperature, window, floor=self.floor)
         inside = self.grid.contains(poses[:, :2])
         return np.where(inside, near.log_density(poses), self.floor)
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw a pixel by its mass, a heading given the pixel, then uniformly inside the cell; (n, 3)."""
-        mass = np.exp(self.location.reshape(-1).astype(np.float64))
-        pixels = rng.choice(self.location.size, size=n, p=mass / mass.sum())
+        mass = np.exp(self._drawn_log_mass - self._drawn_log_mass.max())
+        pixels = self._drawn_pixels[rng.choice(len(mass), size=n, p=mass / mass.sum())]
         distinct, place = np.unique(pixels, return_inverse=True)
-        cumulative = np.cumsum(np.exp(self.headings_at(distinct).astype(np.float64)), axis=1)
+        headings = self.headings_at(distinct).astype(np.float64)
+        headings -= headings.max(axis=1, keepdims=True)
+        cumulative = np.cumsum(np.exp(headings / self.temperature), axis=1)
         cumulative /= cumulative[:, -1:]
         bins = len(self.bias)
         yaw_bin = np.minimum((cumulative[place] <= rng.random((n, 1))).sum(axis=1), bins - 1)
@@ -131,25 +165,64 @@ class LazyOrientation:
         bins = len(self.bias)
         yaw_bin = np.rint(poses[:, 2] * (bins / se2.TWO_PI)).astype(np.int64) % bins
         joint = self.location[row, col].astype(np.float64) + self.headings_at(distinct)[place, yaw_bin]
+        joint = joint / self.temperature - self.log_partition
         return np.where(self.grid.contains(poses[:, :2]), joint, self.floor)
 
     def to_maps(self) -> LocationOrientationMaps:
         """The same with the head evaluated everywhere."""
         headings = self.headings_at(np.arange(self.location.size))
         shape = (len(self.bias), self.grid.rows, self.grid.cols)
-        return LocationOrientationMaps(self.location, headings.T.reshape(shape), self.grid, floor=self.floor)
+        whole = LocationOrientationMaps(self.location, headings.T.reshape(shape), self.grid, floor=self.floor)
+        return whole.tempered(self.temperature)
 
     def modes(self, k: int) -> GaussianMixture:
         """The at most `k` highest modes of the joint density; evaluates the head everywhere."""
         return self.to_maps().modes(k)
 
-    def tempered(self, temperature: float) -> "LazyOrientation | LocationOrientationMaps":
-        """The density to the power 1 / temperature; its normaliser needs the head everywhere unless that is 1."""
-        return self if temperature == 1.0 else self.to_maps().tempered(temperature)
+    def tempered(self, temperature: float) -> "LazyOrientation":
+        """The joint density to the power 1 / temperature, as `LocationOrientationMaps` tempers it.
+
+        The normaliser is joint too: headings are worked out where the tempered density has its mass, see above.
+        """
+        if checked_temperature(temperature) == 1.0:
+            return self
+        same = copy(self)
+        total = self.temperature * temperature
+        pixels, log_mass = self._mass(1.0 / total)
+        partition = float(logsumexp(log_mass)) + 2.0 * float(np.log(self.grid.metres_per_pixel))
+        values = {
+            "temperature": total,
+            "log_partition": partition,
+            "_drawn_pixels": pixels,
+            "_drawn_log_mass": log_mass,
+        }
+        for name, value in values.items():
+            object.__setattr__(same, name, value)
+        return same
 
     def with_outliers(self, probability: float) -> OutlierMixture:
         """Allow for a measurement that says nothing: mix in the uniform density over the crop."""
         return OutlierMixture(self, probability)
+
+    def _mass(self, power: float) -> tuple[IntArray, FloatArray]:
+        """Flat pixels (M,) that hold the mass of the density to a power but for a millionth, and ln of each one's."""
+        location, bins = self.location.reshape(-1), len(self.bias)
+        order = np.argsort(-location, kind="stable")
+        at = power * location[order].astype(np.float64)
+        most = (1.0 - power) * np.log(se2.TWO_PI if power < 1.0 else se2.TWO_PI / bins)
+        with np.errstate(divide="ignore"):
+            rest = at[0] + most + np.log(np.cumsum(np.exp(at - at[0])[::-1])[::-1])
+        found: list[FloatArray] = []
+        total, begin = -np.inf, 0
+        while begin < len(order) and rest[begin] > total + np.log(_NEGLIGIBLE):
+            headings = power * self.headings_at(order[begin : begin + _BLOCK])
+            peaks = headings.max(axis=1)
+            integrals = np.exp(headings - peaks[:, None]).sum(axis=1, dtype=np.float64) * (se2.TWO_PI / bins)
+            found.append(at[begin : begin + _BLOCK] + peaks + np.log(integrals))
+            total = np.logaddexp(total, logsumexp(found[-1]))
+            begin += _BLOCK
+        log_mass = np.concatenate(found)
+        return order[: len(log_mass)], log_mass
 
     def _pixels(self, poses: FloatArray) -> tuple[IntArray, IntArray]:
         """Row and column (N,) of the pixel that each pose lies in, or the nearest one."""

@@ -205,6 +205,7 @@ def test_numbers_and_arrays_come_back_from_an_archive_bit_for_bit(tmp_path):
         "floats": floats.tolist(),
         "stamps": [2**63 - 1, -(2**63)],
         "nested": [{"array": floats}, [np.arange(3, dtype=np.float32), None, True, "ü"]],
+        "endless": [np.inf, {"least": -np.inf}],
     }
     write_archive(tmp_path / "tree", tree)
     back = read_archive(tmp_path / "tree")
@@ -213,6 +214,8 @@ def test_numbers_and_arrays_come_back_from_an_archive_bit_for_bit(tmp_path):
     np.testing.assert_array_equal(back["nested"][0]["array"], floats)
     assert back["nested"][1][0].dtype == np.float32
     assert back["nested"][1][1:] == [None, True, "ü"]
+    assert back["endless"] == tree["endless"]
     assert zipfile.is_zipfile(tmp_path / "tree")
-    with pytest.raises(SkyfixError, match=r"archive: expected keys other than \$array"):
-        write_archive(tmp_path / "tree", {"$array": 1})
+    for key in ("array", "float"):
+        with pytest.raises(SkyfixError, match=rf"archive: expected keys other than \${key}"):
+            write_archive(tmp_path / "tree", {f"${key}": 1})

@@ -113,6 +113,16 @@ def test_it_comes_back_bit_for_bit_and_is_known_again(tmp_path, kind):
     assert [other for other, make in MAKERS.items() if is_same_likelihood(back, make())] == [kind]
 
 
+def test_a_lazy_head_comes_back_as_tempered_as_it_was(tmp_path):
+    likelihood = lazy().tempered(3.0)
+    write_archive(tmp_path / "likelihood", likelihood_tree(likelihood))
+    back = likelihood_from_tree(read_archive(tmp_path / "likelihood"))
+    poses = np.random.default_rng(4).uniform([-20.0, -30.0, -np.pi], [40.0, 40.0, np.pi], (300, 3))
+    np.testing.assert_array_equal(back.log_density(poses), likelihood.log_density(poses))
+    assert is_same_likelihood(back, likelihood)
+    assert not is_same_likelihood(back, lazy())
+
+
 def test_one_that_differs_in_one_number_is_another():
     for make in (lazy, two_level, emulated):
         tree = likelihood_tree(make())

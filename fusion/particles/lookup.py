@@ -92,7 +92,7 @@ def lookup_of(likelihood: object, temperature: float, poses: Callable[[], FloatA
     ----------
     likelihood
         One with a method ``lookup(temperature)``, or one that works its table out near poses (N, 3) only and has
-        ``lookup_near(poses)``, then at temperature 1.
+        ``lookup_near(poses, temperature)``.
     temperature
         Flattens the likelihood.
     poses
@@ -101,4 +101,4 @@ def lookup_of(likelihood: object, temperature: float, poses: Callable[[], FloatA
     whole, near = getattr(likelihood, "lookup", None), getattr(likelihood, "lookup_near", None)
     if whole is not None:
         return whole(temperature)
-    return near(poses()) if near is not None and temperature == 1.0 else None
+    return None if near is None else near(poses(), temperature)

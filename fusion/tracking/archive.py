@@ -1,14 +1,14 @@
 """Trees of lists, dictionaries, numbers, strings and arrays in one file, exactly: npz with JSON inside, no pickle.
 
 Every array is an entry of the npz, once, however often it occurs; JSON, itself an entry, holds the rest and names the
-arrays. Python writes floats so
-that they read back bit for bit.
+arrays. Python writes floats so that they read back bit for bit; JSON has no infinity, which is written by its name.
 """
 
 import json
 import os
 import zipfile
 from contextlib import suppress
+from math import isfinite
 from pathlib import Path
 from threading import get_ident
 from typing import Any, TypeAlias
@@ -22,6 +22,7 @@ Tree: TypeAlias = bool | int | float | str | NDArray[Any] | list["Tree"] | dict[
 
 _JSON = "json"
 _ARRAY = "$array"  # the key of a reference to an array; no key of a tree
+_FLOAT = "$float"  # the key of a float that JSON does not have
 
 
 def write_archive(path: str | Path, tree: Tree) -> None:
@@ -93,12 +94,16 @@ def _packed(tree: Tree, arrays: dict[str, NDArray[Any]], names: dict[Any, str]) 
         arrays[name] = tree
         return {_ARRAY: name}
     if isinstance(tree, dict):
-        if _ARRAY in tree:
-            raise SkyfixError(f"archive: expected keys other than {_ARRAY}, got it")
+        for key in (_ARRAY, _FLOAT):
+            if key in tree:
+                raise SkyfixError(f"archive: expected keys other than {key}, got it")
         return {key: _packed(value, arrays, names) for key, value in tree.items()}
     if isinstance(tree, list | tuple):
         return [_packed(value, arrays, names) for value in tree]
-    return plain(tree)
+    value = plain(tree)
+    if isinstance(value, float) and not isfinite(value):
+        return {_FLOAT: repr(value)}
+    return value
 
 
 def _unpacked(packed: Any, arrays: Any, known: dict[str, NDArray[Any]]) -> Any:
@@ -108,6 +113,8 @@ def _unpacked(packed: Any, arrays: Any, known: dict[str, NDArray[Any]]) -> Any:
             if name not in known:
                 known[name] = arrays[name]
             return known[name]
+        if packed.keys() == {_FLOAT}:
+            return float(packed[_FLOAT])
         return {key: _unpacked(value, arrays, known) for key, value in packed.items()}
     if isinstance(packed, list):
         return [_unpacked(value, arrays, known) for value in packed]

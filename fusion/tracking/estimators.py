@@ -10,6 +10,7 @@ from fusion.fixed_lag import FixedLagSettings
 from fusion.graph_filter import FilterAndGraph, GraphFilter
 from fusion.hypotheses import HypothesisSettings
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.particles.kld_sampling import KldSampling
 from fusion.prior import UniformPrior
 from fusion.tracking.archive import Tree
 from fusion.tracking.resumable import ResumableFilter
@@ -54,6 +55,11 @@ def estimator_like(name: str, settings: Any) -> ResumableFilter:
         assert start is not None  # asked for
         return GraphFilter(start, graph, hypotheses)
     if name == FilterAndGraph.__name__:
-        inner = ParticleFilter(np.zeros((1, 3)), 0, ParticleFilterSettings(**settings["filter"]))
+        inner = ParticleFilter(np.zeros((1, 3)), 0, _filter_settings(settings["filter"]))
         return FilterAndGraph(inner, FixedLagSettings(**settings["graph"]))
-    return ParticleFilter(np.zeros((1, 3)), 0, ParticleFilterSettings(**settings))
+    return ParticleFilter(np.zeros((1, 3)), 0, _filter_settings(settings))
+
+
+def _filter_settings(tree: Any) -> ParticleFilterSettings:
+    adaptive = tree["adaptive"]
+    return ParticleFilterSettings(**{**tree, "adaptive": None if adaptive is None else KldSampling(**adaptive)})

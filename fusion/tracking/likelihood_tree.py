@@ -19,7 +19,7 @@ _FIELDS: dict[type, tuple[str, ...]] = {
     GaussianLikelihood: ("mean", "covariance", "floor"),
     LikelihoodVolume: ("log_prob", "floor"),
     LocationOrientationMaps: ("location", "orientation", "confidence", "floor"),
-    LazyOrientation: ("location", "features", "weights", "bias", "floor"),
+    LazyOrientation: ("location", "features", "weights", "bias", "floor", "temperature"),
     TwoLevelLikelihood: ("coarse", "cut", "fine", "floor"),
     EmulatedLikelihood: ("answer", "half_box", "weights", "centres", "sigmas", "halves", "temperature", "floor"),
 }
@@ -55,6 +55,9 @@ def likelihood_from_tree(tree: Any) -> PoseLikelihood:
     kind = {known.__name__: known for known in _FIELDS}[name]
     if "grid" in fields:
         fields["grid"] = MapGrid(**fields["grid"])
+    if kind is LazyOrientation:  # the temperature is no argument of it
+        temperature = fields.pop("temperature")
+        return LazyOrientation(**fields).tempered(temperature)
     likelihood: PoseLikelihood = kind(**fields)
     return likelihood
 
