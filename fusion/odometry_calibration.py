@@ -16,15 +16,17 @@ MacKay, "Bayesian interpolation", 1992 (evidence).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
+from fusion.errors import SkyfixError
 from fusion.graph.assembly import pose_graph
 from fusion.graph.chain import Chain
+from fusion.graph.covariances import positive_definite, raised
 from fusion.graph.measurements import Measurement, Measurements
 from fusion.graph.odometry_drift import OdometryDrift
 from fusion.graph.propagation import Propagated, propagate
@@ -38,6 +40,7 @@ _LARGEST_S = 0.45
 _ROUNDS = 3
 _CAUTION = 1.0  # ln of the factor by which the odometry is trusted less before its errors are known
 _LEAST_LOG_FACTORS = np.log([0.2, 0.2, 0.25, 0.1])  # jitter that comes and goes between measurements leaves no evidence
+_LEAST_VARIANCE = 1e-8  # 0.1 mm, 0.1 mrad: an odometry said to be surer is not solved for in a trial's few steps
 _TRIAL_STEPS = 2
 _MOST_STEPS = 4
 
@@ -52,6 +55,11 @@ class CalibrationPrior:
         About zero.
     log_noise : float
         Of ln of the factors of noise and walk, about zero.
+
+    Raises
+    ------
+    SkyfixError
+        When a value is not positive and finite.
     """
 
     clock_offset_s: float = 0.1
@@ -59,6 +67,12 @@ class CalibrationPrior:
     heading_lead_m: float = 0.7
     heading_blur_s: float = 0.2
     log_noise: float = 0.7
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise SkyfixError(f"calibration prior {entry.name}: expected > 0, got {value}")
 
     @property
     def sigmas(self) -> FloatArray:
@@ -117,9 +131,13 @@ def calibrate_odometry(
     Raises
     ------
     SkyfixError
-        As `smooth` does.
+        As `smooth` does, and when no trial has a finite evidence.
     """
     stamps = checked_stamps(stamps_ns)
+    if (np.diff(stamps) <= 0).any():
+        raise SkyfixError("stamps: expected strictly increasing, got a repeat or a step back")
+    if len(measurements) != len(stamps):
+        raise SkyfixError(f"odometry calibration: expected {len(stamps)} measurements, got {len(measurements)}")
     settings = settings or SmootherSettings()
     if len(stamps) < 2:
         return OdometryCalibration()
@@ -129,7 +147,8 @@ def calibrate_odometry(
     poses = initial.interpolate(stamps)
     covariances = np.repeat(np.eye(3)[None], len(stamps), axis=0)
     if initial.covariances is not None:
-        covariances = initial.covariances[np.searchsorted(initial.stamp_ns, stamps, side="right") - 1]
+        at = np.searchsorted(initial.stamp_ns, stamps, side="right") - 1
+        covariances = positive_definite(initial.covariances[at])
     values = np.zeros(len(sigmas))
     careful = np.array([*[0.0] * 4, *[_CAUTION] * 4])
     found = search.propagated(careful, seen, poses, covariances)
@@ -137,7 +156,9 @@ def calibrate_odometry(
         held = found
 
         def cost(tried: FloatArray, held: Propagated = held) -> float:
-            return 0.5 * float(((tried / sigmas) ** 2).sum()) - search.log_evidence(tried, held, seen.nodes)
+            with np.errstate(over="ignore"):  # far from a prior that is very sure
+                unusual = 0.5 * float(((tried / sigmas) ** 2).sum())
+            return unusual - search.log_evidence(tried, held, seen.nodes)
 
         for step in _DIRECTIONS:
             values = _best_along(step, values, cost)
@@ -164,7 +185,7 @@ class _Search:
         poses = calibration.corrected(self.odometry).interpolate(self.stamps)
         deltas = se2.between(poses[:-1], poses[1:])
         noise = calibration.noise(self.noise)
-        return Chain(deltas, noise.covariances(deltas, np.diff(self.stamps) * 1e-9))
+        return Chain(deltas, raised(noise.covariances(deltas, np.diff(self.stamps) * 1e-9), _LEAST_VARIANCE))
 
     def propagated(
         self, values: FloatArray, seen: Measurements, poses: FloatArray, covariances: FloatArray
@@ -206,14 +227,21 @@ def _calibration(values: FloatArray) -> OdometryCalibration:
 
 def _best_along(step: FloatArray, origin: FloatArray, cost: Callable[[FloatArray], float]) -> FloatArray:
     """The minimum along a direction: downhill by steps, then the vertex of a parabola through three costs."""
-    costs = {k: cost(origin + k * step) for k in (-1, 0, 1)}
+
+    def at(steps: float) -> float:
+        found = cost(origin + steps * step)
+        return found if np.isfinite(found) else np.inf
+
+    costs = {k: at(k) for k in (0, -1, 1)}  # of equals the first: not to move
     best = min(costs, key=costs.__getitem__)
+    if costs[best] == np.inf:
+        raise SkyfixError("odometry calibration: expected a finite evidence of the measurements, got none in any trial")
     while 0 < abs(best) < _MOST_STEPS and (further := best + int(np.sign(best))) not in costs:
-        costs[further] = cost(origin + further * step)
+        costs[further] = at(further)
         best = min(costs, key=costs.__getitem__)
-    if best - 1 not in costs or best + 1 not in costs:
-        return origin + best * step
-    below, here, above = (costs[best + k] for k in (-1, 0, 1))
+    below, here, above = (costs.get(best + k, np.inf) for k in (-1, 0, 1))
     bend = below - 2.0 * here + above
-    vertex = origin + step * (best + (0.5 * (below - above) / bend if bend > 0.0 else 0.0))
-    return vertex if cost(vertex) < here else origin + best * step
+    if not 0.0 < bend < np.inf:
+        return origin + best * step
+    vertex = best + 0.5 * (below - above) / bend
+    return origin + (vertex if at(vertex) < here else best) * step

@@ -5,6 +5,7 @@ Einfluss der Spaltbreite auf die Intensitätsverteilung in Spektrallinien", Zeit
 grows to 2.1 times itself, whatever the span.
 """
 
+import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -17,6 +18,19 @@ from fusion.odometry import OdometryNoise
 from fusion.trajectory import Trajectory
 
 _NS = 1_000_000_000
+_BEYOND_S = 1.5
+"""So far beyond its ends, whatever its headings' lead, an odometry is carried on: half a second that it may fall short
+of the stamps by, and a clock that is off by up to a second."""
+_LARGEST = {
+    "clock_offset_s": 1e10,  # stamps hold 9.2e9
+    "heading_lead_s": 60.0,
+    "mount_yaw_rad": 100.0,
+    "log_scale": 10.0,
+    "heading_lead_m": 1000.0,
+    "heading_bias_rad_per_m": 10.0,
+    "heading_blur_s": 60.0,
+}
+_LARGEST_FACTOR = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +64,7 @@ class OdometryCalibration:
     Raises
     ------
     SkyfixError
-        When a value is not finite, a factor not positive, or the blur negative.
+        When a value is not finite or larger than any odometry's, a factor not positive, or the blur negative.
     """
 
     clock_offset_s: float = 0.0
@@ -71,13 +85,23 @@ class OdometryCalibration:
             if not np.isfinite(value) or (factor and value <= 0.0):
                 expected = "a positive number" if factor else "a finite number"
                 raise SkyfixError(f"odometry calibration {entry.name}: expected {expected}, got {value}")
+            largest = _LARGEST.get(entry.name, _LARGEST_FACTOR)
+            if abs(value) > largest:
+                raise SkyfixError(f"odometry calibration {entry.name}: expected at most {largest:g}, got {value}")
         if self.heading_blur_s < 0.0:
             raise SkyfixError(f"odometry calibration heading_blur_s: expected >= 0, got {self.heading_blur_s}")
 
     def corrected(self, odometry: Trajectory) -> Trajectory:
-        """The odometry of the vehicle's body, carried on at both ends as it last moved."""
-        at = _delayed(odometry, self.clock_offset_s)
-        headings = _delayed(odometry, self.clock_offset_s + self.heading_lead_s)
+        """The odometry of the vehicle's body, carried on at both ends as it last moved, by half a second or more.
+
+        Raises
+        ------
+        SkyfixError
+            When its stamps and the clock's offset are too large for 64 bits.
+        """
+        longer = _carried_on(odometry, math.ceil(_BEYOND_S + abs(self.heading_lead_s)))
+        at = _delayed(longer, self.clock_offset_s)
+        headings = _delayed(longer, self.clock_offset_s + self.heading_lead_s)
         first = max(at.span_ns[0], headings.span_ns[0])
         last = min(at.span_ns[1], headings.span_ns[1])
         stamps = np.union1d(np.clip(at.stamp_ns, first, last), [first, last])
@@ -119,12 +143,30 @@ def _sharpened(headings: Trajectory, stamps: IntArray, blur_s: float) -> FloatAr
     return shown - 0.5 * (after + before)
 
 
-def _delayed(odometry: Trajectory, seconds: float) -> Trajectory:
-    """The odometry with later stamps, carried on at both ends by a second as it last moved."""
+def _carried_on(odometry: Trajectory, seconds: int) -> Trajectory:
+    """The odometry with so many seconds more at both ends, each as the second nearest to it."""
     first, last = odometry.span_ns
+    _check_stamps(first - seconds * _NS, last + seconds * _NS)
     near, far = min(first + _NS, last), max(last - _NS, first)
     ends: FloatArray = odometry.interpolate(np.array([first, near, far, last]))
-    before = se2.compose(ends[0], se2.inverse(se2.between(ends[0], ends[1])))
-    after = se2.compose(ends[3], se2.between(ends[2], ends[3]))
-    stamps = np.concatenate([[first - _NS], odometry.stamp_ns, [last + _NS]]) + round(seconds * 1e9)
-    return Trajectory(stamps, np.concatenate([before[None], odometry.poses, after[None]]), None, odometry.frame_id)
+    back, forth = se2.inverse(se2.between(ends[0], ends[1])), se2.between(ends[2], ends[3])
+    before, after = [ends[0]], [ends[3]]
+    for _ in range(seconds):
+        before.append(se2.compose(before[-1], back))
+        after.append(se2.compose(after[-1], forth))
+    away = _NS * np.arange(1, seconds + 1)
+    stamps = np.concatenate([first - away[::-1], odometry.stamp_ns, last + away])
+    return Trajectory(stamps, np.concatenate([before[:0:-1], odometry.poses, after[1:]]), None, odometry.frame_id)
+
+
+def _delayed(odometry: Trajectory, seconds: float) -> Trajectory:
+    """The odometry with later stamps."""
+    later = round(seconds * 1e9)
+    first, last = odometry.span_ns
+    _check_stamps(first + later, last + later)
+    return Trajectory(odometry.stamp_ns + later, odometry.poses, None, odometry.frame_id)
+
+
+def _check_stamps(first: int, last: int) -> None:
+    if first < -(2**63) or last >= 2**63:
+        raise SkyfixError(f"odometry: expected corrected stamps of 64 bits, got {first} to {last} ns")

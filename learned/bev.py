@@ -132,9 +132,11 @@ def bev_counts(points: NDArray[np.floating], ground_z: float, settings: BevSetti
     Raises
     ------
     SkyfixError
-        If the scan is empty, not finite or of a wrong shape.
+        If the scan is empty, not finite or of a wrong shape, or `ground_z` is not finite.
     """
     check_scan(points)
+    if not math.isfinite(ground_z):
+        raise SkyfixError(f"ground_z: expected a finite height in metres, got {ground_z}")
     surface = ground_surface(points, ground_z, settings.half_extent_m)
     ground_rows, ground_cols, on_surface = _cells(points, surface.shape[0], _GROUND_CELL_M)
     near = points[on_surface]

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.arrays import FloatArray, IntArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 
@@ -36,6 +37,8 @@ CLASSES: tuple[str, ...] = tuple(_PALETTE_BY_CLASS)
 PALETTE: NDArray[np.uint8] = np.array(list(_PALETTE_BY_CLASS.values()), dtype=np.uint8)
 """RGB of each class, shape (len(CLASSES), 3)."""
 CLASS_INDEX: dict[str, int] = {name: index for index, name in enumerate(CLASSES)}
+_LARGEST_SIDE = 32_766
+"""OpenCV samples pictures of fewer than 2^15 - 1 pixels on a side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,20 +92,48 @@ class MapRaster:
 
         A class that is one pixel wide on a finer map (a wall) survives coarsening only by luck, so bring maps to the
         resolution that they are matched at from vectors where vectors exist.
+
+        Raises
+        ------
+        SkyfixError
+            If the window, or what it needs of this map, has more than 32,766 pixels on a side.
         """
         ratio = window.metres_per_pixel / self.grid.metres_per_pixel
         if abs(ratio - 1.0) < 1e-9:
             return self.crop(window)
         rows, cols = np.mgrid[0 : window.rows, 0 : window.cols] + 0.5
         source = self.grid.pixel_from_xy(window.xy_from_pixel(np.stack([rows, cols], axis=-1)))
-        source_cols = (source[..., 1] - 0.5).astype(np.float32)
-        source_rows = (source[..., 0] - 0.5).astype(np.float32)
+        first, last = _needed(source, (self.grid.rows, self.grid.cols), 2.0 * ratio)
+        sides = (*(last - first).tolist(), window.rows, window.cols)
+        if max(sides) > _LARGEST_SIDE:
+            raise SkyfixError(
+                f"map window: expected at most {_LARGEST_SIDE} pixels on a side, got {sides[2]} x {sides[3]} "
+                f"from {sides[0]} x {sides[1]} of the map"
+            )
+        part = tuple(slice(*span) for span in zip(first, last, strict=True))
+        source_rows, source_cols = ((source[..., axis] - first[axis] - 0.5).astype(np.float32) for axis in (0, 1))
         if self.classes is not None:
-            sampled = cv2.remap(self.classes, source_cols, source_rows, cv2.INTER_NEAREST, borderValue=0)
+            sampled = cv2.remap(self.classes[part], source_cols, source_rows, cv2.INTER_NEAREST, borderValue=0)
             return MapRaster.from_classes(window, np.asarray(sampled, dtype=np.uint8))
-        smooth = cv2.GaussianBlur(self.picture, (0, 0), 0.5 * ratio) if ratio > 1.5 else self.picture
+        smooth = cv2.GaussianBlur(self.picture[part], (0, 0), 0.5 * ratio) if ratio > 1.5 else self.picture[part]
         picture = cv2.remap(smooth, source_cols, source_rows, cv2.INTER_LINEAR, borderValue=0)
         return MapRaster(window, None, np.asarray(picture, dtype=np.uint8))
+
+
+def _needed(source: FloatArray, shape: tuple[int, int], reach: float) -> tuple[IntArray, IntArray]:
+    """First and one past the last row and column that are sampled at `source` (rows, cols, 2), pixels.
+
+    All of a map that OpenCV can sample. Of a larger one the part, with the reach of the blur about it; it begins at
+    even pixels, for a half is rounded to the even one.
+    """
+    whole = np.array(shape)
+    if whole.max() <= _LARGEST_SIDE:
+        return np.zeros(2, np.int64), whole
+    margin = np.ceil(reach) + 2.0
+    first = np.clip(np.floor(source.min(axis=(0, 1)) - margin), 0.0, whole - 1.0).astype(np.int64)
+    last = np.clip(np.ceil(source.max(axis=(0, 1)) + margin), 1.0, whole).astype(np.int64)
+    first -= first % 2
+    return first, np.maximum(last, first + 1)
 
 
 def _cut(raster: NDArray[np.uint8], row0: int, col0: int, rows: int, cols: int) -> NDArray[np.uint8]:

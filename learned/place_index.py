@@ -15,7 +15,9 @@ and would save what is hardly spent.
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +39,23 @@ _NATS = np.float32(20.0)
 """What a cosine of 1 is worth over one of 0: chosen with simulated scans of Helsinki in view."""
 _CLOSELY, _FINER = 96, 3
 """So many places are voted on at so many headings a bin."""
+_UNREADABLE = (
+    SkyfixError,
+    OSError,
+    EOFError,
+    LookupError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    AttributeError,
+    RuntimeError,
+    MemoryError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What reading a damaged archive raises."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,10 +147,10 @@ class PlaceIndex:
         Raises
         ------
         SkyfixError
-            If `k` or `shortlist` is not positive, or the embedding is of another size.
+            If `k` or `shortlist` is not a positive whole number, or the embedding is of another size.
         """
-        if k < 1 or shortlist < 1:
-            raise SkyfixError(f"retrieval: expected k and shortlist of 1 or more, got {k} and {shortlist}")
+        if not all(isinstance(count, int | np.integer) and count >= 1 for count in (k, shortlist)):
+            raise SkyfixError(f"retrieval: expected whole k and shortlist of 1 or more, got {k} and {shortlist}")
         cosines = self.similarities(embedding)
         alike = _NATS * cosines.max(axis=1, keepdims=True)
         likest = np.argsort(-alike[:, 0], kind="stable")[:shortlist]
@@ -209,22 +228,42 @@ class PlaceIndex:
             If the file is missing or something else.
         """
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 rows, cols, step, x0, y0 = data["grid"].tolist()
-                return cls(
+                embeddings = np.asarray(data["embeddings"], np.float32)
+                read = cls(
                     MapGrid(int(rows), int(cols), step, x0, y0),
-                    data["cells"],
-                    torch.view_as_complex(torch.from_numpy(data["embeddings"].astype(np.float32))),
-                    torch.from_numpy(data["features"]),
+                    np.asarray(data["cells"], np.int64),
+                    torch.view_as_complex(torch.from_numpy(embeddings)),
+                    torch.from_numpy(np.asarray(data["features"], np.float16)),
                     float(data["feature_m"]),
                     int(data["tile_cells"]),
                     float(data["temperature"]),
                     str(data["fingerprint"]),
                     str(data["map_digest"]),
                 )
-        except (OSError, KeyError, ValueError, RuntimeError, AttributeError, zipfile.BadZipFile) as error:
-            what = str(error).splitlines()[0]
+                read._check()
+        except _UNREADABLE as error:
+            what = next(iter(str(error).splitlines()), type(error).__name__)
             raise SkyfixError(f"index {path.name}: expected a file that PlaceIndex.save wrote, got: {what}") from error
+        return read
+
+    def _check(self) -> None:
+        """Raise ValueError unless the parts fit each other."""
+        cells, plan = self.cells, (self.grid.rows, self.grid.cols)
+        if cells.ndim != 2 or cells.shape[1] != 2 or not len(cells) or (cells < 0).any() or (cells >= plan).any():
+            raise ValueError(f"cells {cells.shape} that are not all within {plan[0]} x {plan[1]}")
+        if self.embeddings.ndim != 3 or len(self.embeddings) != len(cells) or not self.embeddings.numel():
+            raise ValueError(f"embeddings {tuple(self.embeddings.shape)} of {len(cells)} places")
+        if self.features.ndim != 3 or not self.features.numel():
+            raise ValueError(f"features {tuple(self.features.shape)}")
+        if not (torch.view_as_real(self.embeddings).isfinite().all() and self.features.isfinite().all()):
+            raise ValueError("embeddings or features that are not finite")
+        per_cell = self.grid.metres_per_pixel / self.feature_m if self.feature_m > 0.0 else 0.0
+        if not (1.0 - 1e-9 < per_cell < np.inf and abs(per_cell - round(per_cell)) < 1e-9):
+            raise ValueError(f"features on {self.feature_m} m for cells of {self.grid.metres_per_pixel} m")
+        if self.tile_cells < 1 or not 0.0 < self.temperature < np.inf:
+            raise ValueError(f"tiles of {self.tile_cells} cells and a temperature of {self.temperature}")
 
 
 def _with_better(scores: Float32Array, chosen: IntArray, better: Float32Array) -> Float32Array:

@@ -35,6 +35,7 @@ _VOTE_CELLS = 2
 _DRIVABLE = ("road", "path", "parking")
 _BARRED = ("building", "water")
 _AT_ONCE = 512
+_LARGEST_TILE_M = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,11 @@ class TileSettings:
         Places are the middles of cells of this side, a multiple of the vote's cells (2 m for the shipped network).
     road_within_m
         Cells with no road, path or car park this near are left out; on a map that has none of them, none are.
+
+    Raises
+    ------
+    SkyfixError
+        If a side is not positive and finite, the tile no multiple of the step, or the distance negative.
     """
 
     tile_m: float = 64.0
@@ -56,8 +62,9 @@ class TileSettings:
     road_within_m: float = 4.0
 
     def __post_init__(self) -> None:
-        ratio = self.tile_m / self.step_m if self.step_m > 0.0 else 0.0
-        if ratio < 1.0 or abs(ratio - round(ratio)) > 1e-9 or self.road_within_m < 0.0:
+        possible = 0.0 < self.step_m <= self.tile_m <= _LARGEST_TILE_M and self.road_within_m >= 0.0
+        ratio = min(self.tile_m / self.step_m, _LARGEST_TILE_M) if possible else 0.0
+        if not possible or abs(ratio - round(ratio)) > 1e-9:
             raise SkyfixError(f"tiles: expected a multiple of a positive step_m, got {self}")
 
 
@@ -101,7 +108,8 @@ class Retriever:
         """
         settings = settings or TileSettings()
         feature_m = _VOTE_CELLS * self._cell_m
-        if abs(settings.step_m / feature_m - round(settings.step_m / feature_m)) > 1e-9:
+        per_cell = settings.step_m / feature_m
+        if round(per_cell) < 1 or abs(per_cell - round(per_cell)) > 1e-9:
             raise SkyfixError(f"tiles: expected a step_m of a multiple of {feature_m:g} m, got {settings.step_m:g} m")
         grid = _covering(map_raster.grid, settings.step_m)
         cells = np.argwhere(_drivable(map_raster, grid, settings))
@@ -133,7 +141,7 @@ class Retriever:
         Raises
         ------
         SkyfixError
-            If the index was made by other weights, or the scan cannot be used.
+            If the index was made by other weights, or the scan or the height of its ground cannot be used.
         """
         if index.fingerprint != self._embedding.network:
             raise SkyfixError(

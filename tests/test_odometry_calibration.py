@@ -1,5 +1,7 @@
 """An odometry's constant errors: found where the drive shows them, left at zero where nothing does."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from fusion import GaussianMixture, OdometryNoise, SmootherSettings, Trajectory,
 from fusion.errors import SkyfixError
 from fusion.factor_graph import OdometryDrift
 from fusion.odometry import increments_at
-from fusion.odometry_calibration import calibrate_odometry
+from fusion.odometry_calibration import CalibrationPrior, _best_along, calibrate_odometry
 from fusion.odometry_errors import OdometryCalibration
 
 SECOND = 1_000_000_000
@@ -173,3 +175,119 @@ def test_impossible_values_are_named(name: str, value: float, expected: str) -> 
 def test_a_negative_blur_is_refused() -> None:
     with pytest.raises(SkyfixError, match=r"odometry calibration heading_blur_s: expected >= 0, got -0\.1"):
         OdometryCalibration(heading_blur_s=-0.1)
+
+
+@pytest.mark.parametrize("name", ["clock_offset_s", "heading_lead_s", "heading_blur_s", "log_scale", "along_noise"])
+def test_values_larger_than_any_odometry_has_are_named(name: str) -> None:
+    """No number of nanoseconds, steps or metres overflows: the value is refused before it is used."""
+    with pytest.raises(SkyfixError, match=rf"odometry calibration {name}: expected at most .*, got 1000000000000.0"):
+        OdometryCalibration(**{name: 1e12})
+
+
+@pytest.mark.parametrize(("first_ns", "offset_s"), [(0, 9.3e9), (0, -9.3e9), (2**63 - 61 * SECOND, 0.0)])
+def test_stamps_that_would_overflow_are_refused(first_ns: int, offset_s: float) -> None:
+    odometry = Trajectory(drive(0.3).stamp_ns + first_ns, drive(0.3).poses)
+    with pytest.raises(SkyfixError, match="odometry: expected corrected stamps of 64 bits, got"):
+        OdometryCalibration(clock_offset_s=offset_s).corrected(odometry)
+
+
+@pytest.mark.parametrize("clock", [-0.45, 0.0, 0.45])
+@pytest.mark.parametrize("lead", [-30.0, -0.45, 0.0, 0.45, 30.0])
+def test_corrected_covers_half_a_second_more_than_the_odometry(clock: float, lead: float) -> None:
+    odometry = drive(0.3)
+    first, last = OdometryCalibration(clock, lead).corrected(odometry).span_ns
+    assert first <= odometry.span_ns[0] - SECOND // 2
+    assert last >= odometry.span_ns[1] + SECOND // 2
+
+
+def asked(errors: OdometryCalibration, count: int, missing_s: float) -> dict[str, Any]:
+    """The arguments for a drive of `count` exact measurements, the odometry beginning so long after the first."""
+    truth, covariance = drive(0.4), np.diag([0.1, 0.1, np.deg2rad(0.5)]) ** 2
+    stamps = truth.stamp_ns[40:-40:10][:count]
+    poses, told = truth.interpolate(stamps), with_errors(truth, errors)
+    kept = told.stamp_ns >= stamps[0] + missing_s * SECOND
+    return {
+        "stamps_ns": stamps,
+        "odometry": Trajectory(told.stamp_ns[kept], told.poses[kept], None, "odometry"),
+        "noise": OdometryNoise(),
+        "measurements": [GaussianMixture(np.ones(1), pose[None], covariance[None]) for pose in poses],
+        "prior": UniformPrior(poses[0], 5.0, 0.2),
+        "initial": Trajectory(stamps, poses, np.repeat(covariance[None], len(stamps), axis=0)),
+    }
+
+
+def test_an_odometry_may_begin_half_a_second_late() -> None:
+    """Clock and lead are tried together, up to 0.9 s, and half a second is missing."""
+    found = calibrate_odometry(**asked(OdometryCalibration(0.2, 0.2), 40, 0.45))
+    assert found.clock_offset_s == pytest.approx(0.2, abs=0.03)
+    assert found.heading_lead_s + found.heading_lead_m / SPEED == pytest.approx(0.2, abs=0.03)
+
+
+def test_a_standstill_told_without_noise_moves_nothing() -> None:
+    """10 s of standstill, and no noise by the second."""
+    truth, given = drive(0.4), asked(OdometryCalibration(), 60, -1.0)
+    poses = truth.poses.copy()
+    poses[200:400] = poses[200]
+    poses[400:] = se2.compose(se2.compose(poses[200], se2.inverse(poses[400])), poses[400:])
+    stands = Trajectory(truth.stamp_ns, poses)
+    seen = stands.interpolate(given["stamps_ns"])
+    covariance = given["measurements"][0].covariances
+    given["odometry"] = Trajectory(stands.stamp_ns, poses, None, "odometry")
+    given["noise"] = OdometryNoise(position_m_per_sqrt_s=0.0, heading_rad_per_sqrt_s=0.0)
+    given["measurements"] = [GaussianMixture(np.ones(1), pose[None], covariance) for pose in seen]
+    given["initial"] = Trajectory(given["stamps_ns"], seen, np.repeat(covariance, len(seen), axis=0))
+    given["prior"] = UniformPrior(seen[0], 5.0, 0.2)
+    found = calibrate_odometry(**given)
+    assert found.clock_offset_s == pytest.approx(0.0, abs=0.02)
+    assert found.heading_lead_s + found.heading_lead_m / SPEED == pytest.approx(0.0, abs=0.02)
+
+
+def test_an_odometry_without_noise_is_not_led_astray() -> None:
+    given = asked(OdometryCalibration(), 40, -1.0)
+    found = calibrate_odometry(**{**given, "noise": OdometryNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)})
+    assert found.clock_offset_s == pytest.approx(0.0, abs=0.01)
+    assert found.heading_lead_s + found.heading_lead_m / SPEED == pytest.approx(0.0, abs=0.02)
+
+
+def test_what_does_not_fit_together_is_refused() -> None:
+    given = asked(OdometryCalibration(), 10, -1.0)
+    stamps, measurements = given["stamps_ns"], given["measurements"]
+    twice = np.where(np.arange(10) == 5, stamps[4], stamps)
+    for wrong in (twice, stamps[::-1]):
+        with pytest.raises(SkyfixError, match="stamps: expected strictly increasing, got a repeat or a step back"):
+            calibrate_odometry(**{**given, "stamps_ns": wrong})
+    for count in (0, 7, 11):
+        with pytest.raises(SkyfixError, match=f"odometry calibration: expected 10 measurements, got {count}"):
+            calibrate_odometry(**{**given, "measurements": (measurements + measurements)[:count]})
+
+
+def test_no_finite_evidence_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is found where nothing can be compared; a trial that alone has no number is passed over."""
+    monkeypatch.setattr("fusion.odometry_calibration._Search.log_evidence", lambda *_: np.nan)
+    with pytest.raises(SkyfixError, match="expected a finite evidence of the measurements, got none in any trial"):
+        calibrate_odometry(**asked(OdometryCalibration(), 10, -1.0))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize(("low", "high", "best"), [(-0.6, 0.4, 0.0), (0.4, 2.0, 0.5), (-0.1, 0.6, 0.5), (-1, 2, 0.3)])
+def test_trials_without_a_number_are_passed_over(bad: float, low: float, high: float, best: float) -> None:
+    """Steps of a half along a parabola with its minimum at 0.3 that has costs in an interval only."""
+    step, start = np.array([0.5]), np.zeros(1)
+    found = _best_along(step, start, lambda at: (at[0] - 0.3) ** 2 if low < at[0] < high else bad)
+    np.testing.assert_allclose(found, best, atol=1e-12)
+
+
+def test_where_nothing_differs_nothing_moves() -> None:
+    np.testing.assert_array_equal(_best_along(np.array([0.5]), np.zeros(1), lambda at: 1.0), 0.0)
+
+
+def test_a_prior_that_is_very_sure_is_kept_to() -> None:
+    given = asked(OdometryCalibration(clock_offset_s=0.2), 10, -1.0)
+    found = calibrate_odometry(**given, calibration_prior=CalibrationPrior(clock_offset_s=1e-200))
+    assert found.clock_offset_s == 0.0
+
+
+@pytest.mark.parametrize("value", [0.0, -0.1, np.nan, np.inf])
+def test_impossible_priors_are_named(value: float) -> None:
+    with pytest.raises(SkyfixError, match=f"calibration prior clock_offset_s: expected > 0, got {value}"):
+        CalibrationPrior(clock_offset_s=value)
