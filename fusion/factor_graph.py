@@ -68,6 +68,12 @@ class SmootherResult:
     calibrations, calibration_covariances : (S, 3), (S, 3, 3) float64
         The odometry's ln scale, mounting yaw (rad) and heading bias (rad / m) on every stretch of road, when the
         settings have a drift; S is 0 otherwise.
+    other_residuals : (F,) float64
+        How far the smoothed poses are from each of the loop closures and absolute fixes, in the order in which they
+        were given: Mahalanobis distances, in standard deviations.
+    other_weights : (F,) float64
+        Share of its information, in [0, 1], that the robust loss left each: near 1 for one that is believed, near 0
+        for one that was let go.
     """
 
     trajectory: Trajectory
@@ -77,6 +83,8 @@ class SmootherResult:
     log_evidence: float
     calibrations: FloatArray
     calibration_covariances: FloatArray
+    other_residuals: FloatArray
+    other_weights: FloatArray
 
 
 def smooth(
@@ -146,6 +154,8 @@ def smooth(
     assert last.calibration_covariances is not None
     chosen = np.full(len(stamps), NOT_MEASURED, dtype=np.int64)
     chosen[seen.nodes] = found.chosen
+    residuals = [other.residual(last.poses) for other in others]
+    weights = [other.weight(residual) for other, residual in zip(others, residuals, strict=True)]
     return SmootherResult(
         Trajectory(stamps, last.poses, last.covariances),
         chosen,
@@ -154,6 +164,8 @@ def smooth(
         found.log_evidence,
         last.calibrations,
         last.calibration_covariances,
+        np.array(residuals, dtype=np.float64),
+        np.array(weights, dtype=np.float64),
     )
 
 

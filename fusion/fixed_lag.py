@@ -36,8 +36,9 @@ from fusion.graph.lag_rounds import refreshed, seen_at
 from fusion.graph.lag_settings import FixedLagSettings
 from fusion.graph.lag_window import KeptMeasurement, LagWindow, first_window
 from fusion.graph.measurements import Measurement
-from fusion.graph.patch import LikelihoodPatch, patch_of
+from fusion.graph.patch import LikelihoodPatch, patch_of, without_outliers
 from fusion.graph.sites import Sites
+from fusion.likelihood import OutlierMixture
 from fusion.odometry import OdometryIncrement
 from fusion.prior import UniformPrior
 from fusion.tracking.tracker_input import check_likelihood, checked_increment, checked_stamp, one_line
@@ -209,7 +210,8 @@ class FixedLagSmoother:
         stamp_ns : int
             From the oldest to the newest pose held.
         likelihood : PoseLikelihood, LikelihoodPatch or GaussianMixture
-            Tempered for errors that are correlated in time, without outliers.
+            Tempered for errors that are correlated in time. An outlier probability of its own counts beside the
+            settings'.
 
         Raises
         ------
@@ -296,5 +298,7 @@ def _kept(likelihood: Measurement, pose: FloatArray, covariance: FloatArray) -> 
     if isinstance(likelihood, GaussianLikelihood):
         return likelihood.modes(1)
     if isinstance(likelihood, (GaussianMixture, LikelihoodPatch)):
+        return likelihood
+    if isinstance(likelihood, OutlierMixture) and isinstance(without_outliers(likelihood)[0], GaussianLikelihood):
         return likelihood
     return patch_of(likelihood, around(pose, covariance))

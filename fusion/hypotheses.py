@@ -31,7 +31,7 @@ from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.graph.basins import around, distance, own_part
 from fusion.graph.measurements import Measurement
-from fusion.graph.patch import LikelihoodPatch, patch_of
+from fusion.graph.patch import LikelihoodPatch, patch_of, without_outliers
 from fusion.odometry import OdometryIncrement
 from fusion.tracking.tracker_input import check_likelihood, checked_stamp
 from fusion.tracking.tracker_report import Outcome
@@ -234,9 +234,11 @@ class HypothesisSmoother:
 
     def _parts(self, stamp_ns: int, likelihood: Measurement) -> list[Measurement]:
         """What each hypothesis is to see of a likelihood: the cells that none of those apart predicts better."""
-        if isinstance(likelihood, (GaussianLikelihood, GaussianMixture)) or len(self) == 1:
+        if isinstance(likelihood, GaussianMixture) or len(self) == 1:
             return [likelihood] * len(self)
         if not isinstance(likelihood, LikelihoodPatch):
+            if isinstance(without_outliers(likelihood)[0], GaussianLikelihood):
+                return [likelihood] * len(self)
             check_likelihood(likelihood)
         there = [smoother.prediction(stamp_ns) for smoother in self._smoothers]
         parts: list[Measurement] = []

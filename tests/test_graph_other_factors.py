@@ -69,6 +69,46 @@ def test_fixes_hold_a_drive_and_a_wrong_one_is_let_go():
     assert mean_error(misled, truth) < mean_error(held, truth) + 0.1
 
 
+def test_the_wrong_closure_and_the_wrong_fix_are_told_by_their_weights():
+    stamps, increments, truth, start, prior = circle(seed=2)
+    spread, rng = np.diag([0.5, 0.4]) ** 2, np.random.default_rng(5)
+    others = [LoopClosure(k, k + 30, se2.between(truth[k], truth[k + 30]), TIGHT) for k in (0, 4, 8)]
+    others += [AbsoluteFix(k, truth[k, :2] + rng.multivariate_normal(np.zeros(2), spread), spread) for k in (5, 20, 35)]
+    others[1:1] = [LoopClosure(6, 25, np.zeros(3), TIGHT)]
+    others[5:5] = [AbsoluteFix(27, truth[27, :2] + [-15.0, 20.0], spread)]
+    wrong = np.array([1, 5])
+    result = smooth(stamps, increments, [None] * len(stamps), prior, start, others=others)
+    assert result.other_residuals.shape == result.other_weights.shape == (8,)
+    right = np.setdiff1d(np.arange(8), wrong)
+    assert (result.other_weights[wrong] < 0.02).all()
+    assert (result.other_weights[right] > 0.4).all()
+    assert (result.other_residuals[wrong] > 20.0).all()
+    assert (result.other_residuals[right] < 3.0).all()
+    alone = smooth(stamps, increments, [None] * len(stamps), prior, start)
+    assert alone.other_residuals.shape == alone.other_weights.shape == (0,)
+
+
+def test_residuals_and_weights_are_those_of_the_factors_in_the_graph():
+    """Loss of the residual is GTSAM's error; the weight is the loss's derivative by half the squared residual."""
+    poses = np.array([[1.0, -2.0, 3.0], [4.0, 1.0, -2.9]])
+    tilted = np.array([[0.9, 0.3, 0.02], [0.3, 0.5, -0.03], [0.02, -0.03, 0.04]])
+    values = gtsam.Values()
+    for node, pose in enumerate(poses):
+        values.insert(node, gtsam.Pose2(*pose))
+    for off in (0.1, 1.0, 8.0):
+        delta = se2.between(poses[0], poses[1]) + off * np.array([1.0, -0.5, 0.2])
+        loop = LoopClosure(0, 1, delta, tilted)
+        fix = AbsoluteFix(1, poses[1, :2] + off * np.array([0.6, -1.0]), tilted[:2, :2])
+        for other, loss in (
+            (loop, gtsam.noiseModel.mEstimator.DCS.Create(9.0)),
+            (fix, gtsam.noiseModel.mEstimator.Cauchy.Create(2.0)),
+        ):
+            found, step = other.residual(poses), 1e-5
+            assert other.factor(1.0, *other.nodes).error(values) == pytest.approx(loss.loss(found), rel=1e-6)
+            slope = (loss.loss(found + step) - loss.loss(found - step)) / (2.0 * step * found)
+            assert other.weight(found) == pytest.approx(slope, rel=1e-4)
+
+
 def test_with_loops_the_answer_is_gtsams_own():
     """Poses and covariances of GTSAM's optimizer and marginals on the same factors."""
     stamps, increments, truth, start, prior = circle(12)

@@ -20,7 +20,8 @@ class FixedLagSettings:
     refreshes : int
         Most sites found anew a round; what a round costs grows with it.
     outlier_probability : float
-        Prior chance that a measurement says nothing, in [0, 1).
+        Prior chance that a measurement says nothing, in [0, 1); the chance p of a likelihood's own, given by its
+        `with_outliers`, makes it ``1 - (1 - p) (1 - outlier_probability)``.
     clutter_log_density : float
         ln density per m^2 rad of such a measurement where it does not tell itself, as in `SmootherSettings`.
     huber_width : float

@@ -15,9 +15,11 @@ from fusion.graph.chain_solver import solve_chain, without_first
 from fusion.graph.covariances import positive_definite, turned
 from fusion.graph.patch import LikelihoodPatch
 from fusion.graph.sites import Sites
+from fusion.likelihood import OutlierMixture
 from fusion.odometry import OdometryIncrement
 
-KeptMeasurement = GaussianMixture | LikelihoodPatch
+KeptMeasurement = GaussianMixture | LikelihoodPatch | OutlierMixture
+"""An outlier mixture holds a Gaussian likelihood; any other gives a patch."""
 
 _MOST_STEPS = 6
 _TOLERANCE = 1e-4  # metres and radians; what is left is quadratic in it
@@ -41,7 +43,7 @@ class LagWindow:
         Sites, see `fusion.graph.sites`; zeros where nothing was measured.
     centres, widths : (N, 3), (N, 3, 3) float64
         The cavities under which the sites were found.
-    measurements : tuple of N GaussianMixture, LikelihoodPatch or None
+    measurements : tuple of N KeptMeasurement or None
         What was seen.
     """
 

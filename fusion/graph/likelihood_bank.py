@@ -9,29 +9,28 @@ from numpy.typing import NDArray
 
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
-from fusion.graph.patch import LikelihoodPatch
+from fusion.graph.patch import LikelihoodPatch, either
 from fusion.graph.window_kernel import window_moments
 from fusion.graph.windowed import Windowed, roots_of
 
 
 class LikelihoodBank:
-    """M likelihoods, each mixed with outliers: ``(1 - p) L + p u``.
+    """M likelihoods, each mixed with outliers: ``(1 - p) L + p u``, where p is by its own cause or by that of all.
 
     Parameters
     ----------
     patches : sequence of LikelihoodPatch
         Tempered. Their cells are read where they lie: a drive's are a hundred megabytes, and a window sees a few.
     outlier_probability : float
-        p, in [0, 1).
+        Of all, in [0, 1).
     """
 
     def __init__(self, patches: Sequence[LikelihoodPatch], outlier_probability: float) -> None:
         self._patches = tuple(patches)  # keeps the cells alive
-        self._outlier = outlier_probability
         tables = [(_address_of(patch.log_prob), *patch.log_prob.shape, patch.bin_count) for patch in patches]
         self._tables = np.array(tables, dtype=np.int64).reshape(-1, 5)
         self._tables[:, 4] = self._tables[:, 3] == self._tables[:, 4]
-        self._places = _places_of(patches)
+        self._places = _places_of(patches, outlier_probability)
 
     def __len__(self) -> int:
         return len(self._tables)
@@ -49,7 +48,6 @@ class LikelihoodBank:
         window_moments(
             self._tables,
             self._places,
-            self._outlier,
             np.ascontiguousarray(centres),
             roots,
             found.log_mass,
@@ -61,18 +59,19 @@ class LikelihoodBank:
 
     def outlier_share(self, log_mass: FloatArray) -> FloatArray:
         """Probability (M,) that each is an outlier, given the evidence under its window."""
-        return np.asarray(self._outlier * np.exp(np.minimum(self._places[:, 6] - log_mass, 700.0)))
+        return np.asarray(self._places[:, 7] * np.exp(np.minimum(self._places[:, 6] - log_mass, 700.0)))
 
 
-def _places_of(patches: Sequence[LikelihoodPatch]) -> FloatArray:
-    """(M, 7), see `fusion.graph.window_kernel.window_moments`."""
+def _places_of(patches: Sequence[LikelihoodPatch], outlier_probability: float) -> FloatArray:
+    """(M, 8), see `fusion.graph.window_kernel.window_moments`."""
     grids = [(patch.grid.metres_per_pixel, patch.grid.x0, patch.grid.y0, patch.grid.rows) for patch in patches]
     metres, x0, y0, rows = np.array(grids, dtype=np.float64).reshape(-1, 4).T
     others = [(patch.first_bin, patch.bin_count, patch.floor, patch.log_uniform) for patch in patches]
     first_bin, bin_count, floor, log_uniform = np.array(others, dtype=np.float64).reshape(-1, 4).T
+    outlier = either(outlier_probability, np.array([patch.outlier_probability for patch in patches], dtype=np.float64))
     radians, half = se2.TWO_PI / bin_count, 0.5 * metres
     return np.column_stack(
-        [x0 + half, y0 + rows * metres - half, first_bin * radians, metres, radians, floor, log_uniform]
+        [x0 + half, y0 + rows * metres - half, first_bin * radians, metres, radians, floor, log_uniform, outlier]
     )
 
 

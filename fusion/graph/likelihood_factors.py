@@ -38,7 +38,7 @@ class LikelihoodFactors:
     measurements : sequence of M Measurement
         Tempered for errors that are correlated in time.
     outlier_probability : float
-        Chance that a measurement says nothing, in [0, 1).
+        Chance that a measurement says nothing, in [0, 1); one of its own, by `with_outliers`, counts beside it.
     clutter_log_density : float
         ln density per m^2 rad of such a measurement where it does not tell itself (mixtures of modes).
 

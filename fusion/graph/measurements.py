@@ -10,12 +10,12 @@ from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.graph.likelihood_bank import LikelihoodBank
 from fusion.graph.mixture_bank import MixtureBank
-from fusion.graph.patch import LikelihoodPatch, patch_of
+from fusion.graph.patch import LikelihoodPatch, either, patch_of, without_outliers
 from fusion.graph.windowed import Windowed
 from fusion.likelihood import PoseLikelihood
 
 Measurement = GaussianMixture | LikelihoodPatch | PoseLikelihood
-"""Tempered for errors correlated in time, without outliers."""
+"""Tempered for errors correlated in time; the outlier probability of an outlier mixture counts beside that of all."""
 
 REJECTED = -1
 NOT_MEASURED = -2
@@ -29,7 +29,7 @@ class Measurements:
     measurements : sequence of N Measurement or None
         One a node.
     outlier_probability : float
-        Chance that a measurement says nothing, in [0, 1).
+        Chance that any of them says nothing, in [0, 1).
     clutter_log_density : float
         ln density of such a measurement per m^2 rad where it does not tell itself (mixtures).
     """
@@ -38,18 +38,28 @@ class Measurements:
         self, measurements: Sequence[Measurement | None], outlier_probability: float, clutter_log_density: float
     ) -> None:
         mixtures: dict[int, GaussianMixture] = {}
+        own: list[float] = []  # outlier probabilities of the mixtures
         patches: dict[int, LikelihoodPatch] = {}
         for node, measurement in enumerate(measurements):
-            if isinstance(measurement, GaussianLikelihood):
-                measurement = measurement.modes(1)
+            if measurement is None:
+                continue
             if isinstance(measurement, GaussianMixture):
                 mixtures[node] = measurement
-            elif isinstance(measurement, LikelihoodPatch):
+                own.append(0.0)
+                continue
+            if isinstance(measurement, LikelihoodPatch):
                 patches[node] = measurement
-            elif measurement is not None:
+                continue
+            inner, probability = without_outliers(measurement)
+            if isinstance(inner, GaussianLikelihood):
+                mixtures[node] = inner.modes(1)
+                own.append(probability)
+            else:
                 patches[node] = patch_of(measurement)
         self.nodes: IntArray = np.array([*mixtures, *patches], dtype=np.int64)
-        self._mixtures = MixtureBank(list(mixtures.values()), outlier_probability, clutter_log_density)
+        self._mixtures = MixtureBank(
+            list(mixtures.values()), either(outlier_probability, np.array(own)), clutter_log_density
+        )
         self._bank = LikelihoodBank(list(patches.values()), outlier_probability)
 
     def __len__(self) -> int:

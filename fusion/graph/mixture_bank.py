@@ -32,14 +32,14 @@ class MixtureBank:
     ----------
     mixtures : sequence of GaussianMixture
         Tempered.
-    outlier_probability : float
+    outlier_probability : float or (M,) float64
         p, in [0, 1).
     clutter_log_density : float
         ln density per m^2 rad of a measurement that says nothing.
     """
 
     def __init__(
-        self, mixtures: Sequence[GaussianMixture], outlier_probability: float, clutter_log_density: float
+        self, mixtures: Sequence[GaussianMixture], outlier_probability: float | FloatArray, clutter_log_density: float
     ) -> None:
         count, most = len(mixtures), max((len(mixture) for mixture in mixtures), default=1)
         self._log_weights = np.full((count, most), -np.inf)
@@ -48,9 +48,10 @@ class MixtureBank:
             size = len(mixture)
             self._log_weights[row, :size] = np.log(mixture.weights)
             self._means[row, :size], self._covariances[row, :size] = mixture.means, mixture.covariances
+        outlier = np.broadcast_to(outlier_probability, count)
+        self._log_weights += np.log1p(-outlier)[:, None]
         with np.errstate(divide="ignore"):
-            self._log_weights += np.log1p(-outlier_probability)
-            self._log_null = float(np.log(outlier_probability)) + clutter_log_density
+            self._log_null = np.log(outlier) + clutter_log_density
 
     def __len__(self) -> int:
         return len(self._log_weights)
@@ -59,7 +60,7 @@ class MixtureBank:
         """Those at some places (K,)."""
         same = copy(self)
         same._log_weights, same._means = self._log_weights[places], self._means[places]
-        same._covariances = self._covariances[places]
+        same._covariances, same._log_null = self._covariances[places], self._log_null[places]
         return same
 
     def windowed(self, centres: FloatArray, covariances: FloatArray) -> tuple[Windowed, IntArray]:
@@ -75,7 +76,7 @@ class MixtureBank:
         spreads = np.linalg.solve(total, measured)
         log_det = np.linalg.slogdet(total)[1] + 2.0 * np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)[:, None]
         log_evidence = self._log_weights - 0.5 * (np.einsum("mki,mki->mk", off, means) + log_det + 3.0 * _LOG_TWO_PI)
-        log_evidence = np.column_stack([log_evidence, np.full(len(self), self._log_null)])
+        log_evidence = np.column_stack([log_evidence, self._log_null])
         top = log_evidence.max(axis=1)
         log_mass = top + np.log(np.exp(log_evidence - top[:, None]).sum(axis=1))
         share = np.exp(log_evidence - log_mass[:, None])

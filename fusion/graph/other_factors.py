@@ -13,9 +13,10 @@ from typing import TypeAlias
 import gtsam
 import numpy as np
 
+from fusion import se2
 from fusion.arrays import FloatArray, IntArray, checked
 from fusion.errors import SkyfixError
-from fusion.graph.covariances import noises_of
+from fusion.graph.covariances import noises_of, turned
 
 _KERNELS = gtsam.noiseModel.mEstimator
 
@@ -56,8 +57,20 @@ class LoopClosure:
     def factor(self, widening: float, first: int, second: int) -> gtsam.NonlinearFactor:
         """GTSAM's factor between two keys, its loss so many times as wide."""
         [noise] = noises_of(self.covariance[None], self.delta[None, 2])
-        robust = gtsam.noiseModel.Robust.Create(_KERNELS.DCS.Create((widening * self.width) ** 2), noise)
+        robust = gtsam.noiseModel.Robust.Create(self._loss(widening), noise)
         return gtsam.BetweenFactorPose2(first, second, gtsam.Pose2(*self.delta), robust)
+
+    def residual(self, poses: FloatArray) -> float:
+        """How far poses (N, 3) are from what was seen, in standard deviations: a Mahalanobis distance."""
+        off = se2.log(se2.between(self.delta, se2.between(poses[self.first], poses[self.second])))
+        return float(np.sqrt(off @ np.linalg.solve(turned(self.covariance, -self.delta[2]), off)))
+
+    def weight(self, residual: float) -> float:
+        """Share of its information, in [0, 1], that the loss leaves it at a residual in standard deviations."""
+        return float(self._loss(1.0).weight(residual))
+
+    def _loss(self, widening: float) -> gtsam.noiseModel.mEstimator.DCS:
+        return _KERNELS.DCS.Create((widening * self.width) ** 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,8 +107,20 @@ class AbsoluteFix:
     def factor(self, widening: float, key: int) -> gtsam.NonlinearFactor:
         """GTSAM's factor on a key, its loss so many times as wide."""
         noise = gtsam.noiseModel.Gaussian.Covariance(self.covariance, False)
-        robust = gtsam.noiseModel.Robust.Create(_KERNELS.Cauchy.Create(widening * self.width), noise)
+        robust = gtsam.noiseModel.Robust.Create(self._loss(widening), noise)
         return gtsam.PoseTranslationPrior2D(key, self.position, robust)
+
+    def residual(self, poses: FloatArray) -> float:
+        """How far poses (N, 3) are from what was seen, in standard deviations: a Mahalanobis distance."""
+        off = poses[self.node, :2] - self.position
+        return float(np.sqrt(off @ np.linalg.solve(self.covariance, off)))
+
+    def weight(self, residual: float) -> float:
+        """Share of its information, in [0, 1], that the loss leaves it at a residual in standard deviations."""
+        return float(self._loss(1.0).weight(residual))
+
+    def _loss(self, widening: float) -> gtsam.noiseModel.mEstimator.Cauchy:
+        return _KERNELS.Cauchy.Create(widening * self.width)
 
 
 OtherFactor: TypeAlias = LoopClosure | AbsoluteFix

@@ -1,6 +1,6 @@
 """LikelihoodPatch: the part of a likelihood that matters to a smoother, small enough to keep for a whole drive."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import singledispatch
 
 import numpy as np
@@ -48,11 +48,13 @@ class LikelihoodPatch:
         ln density elsewhere.
     log_uniform : float
         ln density of a measurement that says nothing, see `fusion.likelihood.log_uniform_density`.
+    outlier_probability : float
+        Chance, in [0, 1), that this one says nothing, beside what a smoother's settings say of all.
 
     Raises
     ------
     SkyfixError
-        When shapes disagree or a value is not finite.
+        When shapes disagree, a value is not finite, or the probability is out of range.
     """
 
     log_prob: Float32Array
@@ -61,6 +63,7 @@ class LikelihoodPatch:
     bin_count: int
     floor: float
     log_uniform: float
+    outlier_probability: float = 0.0
 
     def __post_init__(self) -> None:
         log_prob = np.ascontiguousarray(self.log_prob, dtype=np.float32)
@@ -70,6 +73,8 @@ class LikelihoodPatch:
             raise SkyfixError(f"patch: expected ({rows}, {cols}, 1 to {most}) log densities, got {log_prob.shape}")
         if not (np.isfinite(log_prob).all() and np.isfinite(self.floor) and np.isfinite(self.log_uniform)):
             raise SkyfixError("patch: expected finite log densities, got NaN or an infinity")
+        if not 0.0 <= self.outlier_probability < 1.0:
+            raise SkyfixError(f"patch outlier probability: expected in [0, 1), got {self.outlier_probability}")
         object.__setattr__(self, "log_prob", read_only(log_prob))
 
     @property
@@ -84,6 +89,19 @@ class LikelihoodPatch:
         return grid.x0 + half, grid.y0 + grid.height_m - half, self.first_bin * se2.TWO_PI / self.bin_count
 
 
+def either(p: FloatArray | float, q: FloatArray | float) -> FloatArray | float:
+    """The chance of an outlier by one cause or another, as `OutlierMixture.with_outliers` has it; just p for q = 0."""
+    return p + q - p * q
+
+
+def without_outliers(likelihood: PoseLikelihood) -> tuple[PoseLikelihood, float]:
+    """What is inside of an outlier mixture, and the outlier probability; a likelihood of another type itself, and 0."""
+    if not isinstance(likelihood, OutlierMixture):
+        return likelihood, 0.0
+    inner, probability = without_outliers(likelihood.likelihood)
+    return inner, float(either(likelihood.probability, probability))
+
+
 def patch_of(likelihood: PoseLikelihood | LikelihoodPatch, around: Neighbourhood | None = None) -> LikelihoodPatch:
     """What is to be kept of a likelihood that has been tempered for errors correlated in time.
 
@@ -91,15 +109,15 @@ def patch_of(likelihood: PoseLikelihood | LikelihoodPatch, around: Neighbourhood
     ----------
     likelihood : PoseLikelihood
         A volume is cut out of; any other is sampled at the pixels of its grid and every degree. An outlier mixture
-        gives the likelihood inside: a smoother has an outlier probability of its own. A patch stays as it is.
+        gives the likelihood inside with the outlier probability. A patch stays as it is.
     around : Neighbourhood, optional
         Where the pose may be. Everything that was evaluated is kept when left out.
     """
     if isinstance(likelihood, LikelihoodPatch):
         return likelihood
-    if isinstance(likelihood, OutlierMixture):
-        return patch_of(likelihood.likelihood, around)
-    return _patch(likelihood, around)
+    inner, probability = without_outliers(likelihood)
+    patch = _patch(inner, around)
+    return replace(patch, outlier_probability=probability) if probability else patch
 
 
 @singledispatch

@@ -16,7 +16,8 @@ class SmootherSettings:
     Parameters
     ----------
     outlier_probability : float
-        Prior chance that a measurement says nothing, in [0, 1).
+        Prior chance that a measurement says nothing, in [0, 1); the chance p of a likelihood's own, given by its
+        `with_outliers`, makes it ``1 - (1 - p) (1 - outlier_probability)``.
     clutter_log_density : float
         ln density per m^2 rad of a measurement that is about nothing: `fusion.likelihood.log_uniform_density` of the
         crop. The default is that of 40 m x 40 m with all headings.

@@ -90,7 +90,6 @@ def _cells_at(_context: Any, address: Any) -> Any:
 def window_moments(
     tables: NDArray[np.int64],
     places: NDArray[np.float64],
-    outlier: float,
     centres: NDArray[np.float64],
     roots: NDArray[np.float64],
     log_mass: NDArray[np.float64],
@@ -105,11 +104,9 @@ def window_moments(
     tables : (M, 5) int64
         Of each likelihood's ln densities, float32: the address in memory, rows, columns, yaw bins, and whether these
         close to a circle.
-    places : (M, 7) float64
+    places : (M, 8) float64
         x, y and yaw of the centre of the first cell, rows go down; metres and radians of a cell; ln density beyond the
-        cells, and of an outlier.
-    outlier : float
-        Its probability p.
+        cells, and of an outlier; its probability p.
     centres, roots : (M, 3), (M, 3, 3) float64
         Of the windows; the lower triangular roots of their covariances.
     log_mass, means, spreads, flat
@@ -118,7 +115,8 @@ def window_moments(
     """
     for m in range(len(tables)):
         patch = numba.carray(_cells_at(tables[m, 0]), (tables[m, 1], tables[m, 2], tables[m, 3]))
-        first, cell, floor, log_uniform = places[m, :3], places[m, 3:5], places[m, 5], places[m, 6]
+        first, cell, floor = places[m, :3], places[m, 3:5], places[m, 5]
+        log_uniform, outlier = places[m, 6], places[m, 7]
         if _is_wide(roots[m], cell[0], cell[1]):
             log_mass[m] = _sum_cells(
                 patch, first, cell, log_uniform, outlier, centres[m], roots[m], means[m], spreads[m]

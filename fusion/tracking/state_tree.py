@@ -9,12 +9,14 @@ from typing import Any
 
 from fusion.errors import SkyfixError
 from fusion.fixed_lag import LagCounts, LagState
+from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.graph.lag_window import LagWindow
 from fusion.graph.patch import LikelihoodPatch
 from fusion.graph_filter import GraphFilterState
 from fusion.grid import MapGrid
 from fusion.hypotheses import HypothesisState
+from fusion.likelihood import OutlierMixture
 from fusion.particles.filter_state import ParticleFilterState
 from fusion.tracking.archive import Tree
 
@@ -22,6 +24,7 @@ _TYPE, _TUPLE = "$type", "$tuple"
 _TYPES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
+        GaussianLikelihood,
         GaussianMixture,
         GraphFilterState,
         HypothesisState,
@@ -30,6 +33,7 @@ _TYPES: dict[str, type] = {
         LagWindow,
         LikelihoodPatch,
         MapGrid,
+        OutlierMixture,
         ParticleFilterState,
     )
 }
