@@ -12,7 +12,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from fusion.graph.spline import OPTIONS
-from fusion.graph.window_lattice import REACH, sum_lattice
+from fusion.graph.window_lattice import REACH, beyond_cells, bins_of_a_turn, put_moments, sum_lattice
 from fusion.kernels.float_math import intrinsic
 
 _WIDE_CELLS = 1.5  # standard deviations of a window along each axis from which cells are sampled well enough
@@ -30,6 +30,7 @@ def _sum_cells(
     patch: NDArray[np.float32],
     first: NDArray[np.float64],
     cell: NDArray[np.float64],
+    floor: float,
     log_uniform: float,
     outlier: float,
     centre: NDArray[np.float64],
@@ -37,42 +38,49 @@ def _sum_cells(
     mean: NDArray[np.float64],
     spread: NDArray[np.float64],
 ) -> float:
-    """As `window_moments` for one likelihood, summed over its cells (rows, cols, bins); outliers are added exactly."""
+    """As `window_moments` for one likelihood, summed over its cells (rows, cols, bins) and their images a turn apart.
+
+    The floor and outliers are added as the whole window, exactly, and the cells by what they are above the floor.
+    """
     (rows, cols, bins), metres, radians = patch.shape, cell[0], cell[1]
     volume = metres * metres * radians / ((2.0 * np.pi) ** 1.5 * root[0, 0] * root[1, 1] * root[2, 2])
-    total = outlier
-    mean[:] = 0.0
-    spread[:] = 0.0
-    for i in range(3):
-        spread[i, i] = outlier
-    u = np.empty(3)
-    turned = first[2] - centre[2]
-    turned -= 2.0 * np.pi * np.floor((turned + 0.5 * radians * (bins - 1)) / (2.0 * np.pi) + 0.5)
+    volume *= 1.0 - outlier
+    beyond, turn = beyond_cells(floor, log_uniform), bins_of_a_turn(radians)
+    total, s0, s1, s2 = (1.0 - outlier) * beyond + outlier, 0.0, 0.0, 0.0
+    s00, s01, s02, s11, s12, s22 = total, 0.0, 0.0, total, 0.0, total
+    turned = (centre[2] - first[2]) / radians
     for row in range(rows):
         y = first[1] - metres * row - centre[1]
         for col in range(cols):
-            u[0] = (first[0] + metres * col - centre[0]) / root[0, 0]
-            u[1] = (y - root[1, 0] * u[0]) / root[1, 1]
-            plan = u[0] * u[0] + u[1] * u[1]
+            u0 = (first[0] + metres * col - centre[0]) / root[0, 0]
+            u1 = (y - root[1, 0] * u0) / root[1, 1]
+            plan = u0 * u0 + u1 * u1
             if plan > REACH * REACH:
                 continue
-            bend = root[2, 0] * u[0] + root[2, 1] * u[1]
-            for k in range(bins):
-                u[2] = (turned + radians * k - bend) / root[2, 2]
-                square = plan + u[2] * u[2]
-                if square > REACH * REACH:
-                    continue
-                share = (1.0 - outlier) * volume * np.exp(patch[row, col, k] - log_uniform - 0.5 * square)
-                total += share
-                for i in range(3):
-                    mean[i] += share * u[i]
-                    for j in range(3):
-                        spread[i, j] += share * u[i] * u[j]
-    for i in range(3):
-        mean[i] /= total
-    for i in range(3):
-        for j in range(3):
-            spread[i, j] = spread[i, j] / total - mean[i] * mean[j]
+            middle = turned + (root[2, 0] * u0 + root[2, 1] * u1) / radians
+            half = np.sqrt(REACH * REACH - plan) * root[2, 2] / radians
+            least, most = int(np.ceil(middle - half)), int(np.floor(middle + half))
+            mass, flank, square = 0.0, 0.0, 0.0  # sums of 1, u2 and u2 u2
+            for begin in range(least // turn * turn, most + 1, turn):
+                for k in range(max(least - begin, 0), min(most - begin + 1, bins)):
+                    u2 = (begin + k - middle) * radians / root[2, 2]
+                    share = np.exp(-0.5 * u2 * u2) * (np.exp(patch[row, col, k] - log_uniform) - beyond)
+                    mass += share
+                    flank += share * u2
+                    square += share * u2 * u2
+            weight = volume * np.exp(-0.5 * plan)
+            mass, flank, square = weight * mass, weight * flank, weight * square
+            total += mass
+            s0 += mass * u0
+            s1 += mass * u1
+            s2 += flank
+            s00 += mass * u0 * u0
+            s01 += mass * u0 * u1
+            s02 += flank * u0
+            s11 += mass * u1 * u1
+            s12 += flank * u1
+            s22 += square
+    put_moments(total, (s0, s1, s2), (s00, s01, s02, s11, s12, s22), mean, spread)
     return float(np.log(total) + log_uniform)
 
 
@@ -119,7 +127,7 @@ def window_moments(
         log_uniform, outlier = places[m, 6], places[m, 7]
         if _is_wide(roots[m], cell[0], cell[1]):
             log_mass[m] = _sum_cells(
-                patch, first, cell, log_uniform, outlier, centres[m], roots[m], means[m], spreads[m]
+                patch, first, cell, floor, log_uniform, outlier, centres[m], roots[m], means[m], spreads[m]
             )
             flat[m] = 1.0
         else:

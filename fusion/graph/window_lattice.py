@@ -18,6 +18,7 @@ _LANES, _READ = 8, 16  # values of loops that become vector code: fixed numbers,
 _STEP = 1.05
 _CELL_STEP = 0.8
 _ENDLESS = F(1e9)  # bins; an infinity may be optimised away where fast arithmetic is allowed
+_LEAST = -87.0  # what the vector code's exponentials end at
 _HALF, _THREE_QUARTERS = F(0.5), F(0.75)
 
 
@@ -25,6 +26,37 @@ _HALF, _THREE_QUARTERS = F(0.5), F(0.75)
 def _blocks(count: int, size: int) -> int:
     """The least number of blocks that hold so many values."""
     return (count + size - 1) // size
+
+
+@numba.njit(inline="always", **OPTIONS)
+def beyond_cells(floor: float, log_uniform: float) -> float:
+    """The density over uniform outside of a likelihood's cells, never quite 0."""
+    return np.exp(max(floor - log_uniform, _LEAST))
+
+
+@numba.njit(inline="always", **OPTIONS)
+def bins_of_a_turn(radians: float) -> int:
+    """How many yaw bins make the whole circle."""
+    return int(2.0 * np.pi / radians + 0.5)
+
+
+@numba.njit(forceinline=True, **OPTIONS)
+def put_moments(
+    total: float,
+    first: tuple[float, float, float],
+    second: tuple[float, float, float, float, float, float],
+    mean: NDArray[np.float64],
+    spread: NDArray[np.float64],
+) -> None:
+    """Mean and covariance of three coordinates from sums of 1, of them and of their products, upper triangle by rows."""
+    for i in range(3):
+        mean[i] = first[i] / total
+    spread[0, 0], spread[0, 1], spread[0, 2] = second[0] / total, second[1] / total, second[2] / total
+    spread[1, 1], spread[1, 2], spread[2, 2] = second[3] / total, second[4] / total, second[5] / total
+    spread[1, 0], spread[2, 0], spread[2, 1] = spread[0, 1], spread[0, 2], spread[1, 2]
+    for i in range(3):
+        for j in range(3):
+            spread[i, j] -= mean[i] * mean[j]
 
 
 @numba.njit(**INLINED)
@@ -156,7 +188,7 @@ def sum_lattice(
     turned = centre[2] - first[2] - 0.5 * radians * (bins - 1)
     turned -= 2.0 * np.pi * np.floor(turned / (2.0 * np.pi) + 0.5)  # the short way to the middle bin
     turned += 0.5 * radians * (bins - 1)
-    outside = (1.0 - outlier) * np.exp(floor - log_uniform) + outlier
+    beyond, turn = beyond_cells(floor, log_uniform), bins_of_a_turn(radians)
     total, window = 0.0, 0.0
     s0, s1, s2 = 0.0, 0.0, 0.0
     s00, s01, s02, s11, s12, s22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -171,20 +203,29 @@ def sum_lattice(
                 continue
             row = (first[1] - centre[1] - root[1, 0] * u0 - root[1, 1] * u1) / metres
             weight = bells[abs(a)] * bells[counts[0] + 1 + abs(b)]
-            mass, flank, square = outside * plain, 0.0, outside * plain_square  # sums of 1, u2 and u2 u2
+            mass, flank, square, images = 0.0, 0.0, 0.0, 0  # sums of 1, u2 and u2 u2
             if -0.5 <= row < rows - 0.5 and -0.5 <= col < cols - 0.5:
-                turn = (turned + root[2, 0] * u0 + root[2, 1] * u1) / radians - most * stride
-                lowest = int(np.floor(turn + 0.5)) - 1
-                _profile(cells, rows, cols, bins, wraps, row, col, lowest, count, values)
-                begin, end = -_ENDLESS, _ENDLESS
-                if not wraps:
-                    begin, end = F(-0.5 - lowest), F(bins - 0.5 - lowest)
-                mass, flank, square = _along(
-                    values, shifts, shares, lanes, F(turn - lowest), begin, end, F(floor), F(log_uniform)
-                )
-                mass = (1.0 - outlier) * mass + outlier * plain
-                flank *= 1.0 - outlier
-                square = (1.0 - outlier) * square + outlier * plain_square
+                place = (turned + root[2, 0] * u0 + root[2, 1] * u1) / radians - most * stride
+                image, images = 0, 1
+                if not wraps:  # the cells' images a turn apart that the window reaches
+                    image = int(np.floor((place + 0.5 - bins) / turn)) + 1
+                    images = int(np.floor((place + 2.0 * most * stride + 0.5) / turn)) + 1 - image
+                lowest = int(np.floor(place + 0.5)) - 1
+                for k in range(image, image + images):
+                    least = lowest - k * turn
+                    _profile(cells, rows, cols, bins, wraps, row, col, least, count, values)
+                    begin, end = -_ENDLESS, _ENDLESS
+                    if not wraps:
+                        begin, end = F(-0.5 - least), F(bins - 0.5 - least)
+                    along = _along(
+                        values, shifts, shares, lanes, F(place - lowest), begin, end, F(floor), F(log_uniform)
+                    )
+                    mass += along[0]
+                    flank += along[1]
+                    square += along[2]
+            mass = (1.0 - outlier) * (mass + (1 - images) * beyond * plain) + outlier * plain
+            square = (1.0 - outlier) * (square + (1 - images) * beyond * plain_square) + outlier * plain_square
+            flank *= 1.0 - outlier
             window += weight
             f0 += weight * u0 * u0
             f1 += weight * u1 * u1
@@ -199,12 +240,6 @@ def sum_lattice(
             s11 += mass * u1 * u1
             s12 += flank * u1
             s22 += square
-    mean[0], mean[1], mean[2] = s0 / total, s1 / total, s2 / total
-    spread[0, 0], spread[1, 1], spread[2, 2] = s00 / total, s11 / total, s22 / total
-    spread[0, 1], spread[0, 2], spread[1, 2] = s01 / total, s02 / total, s12 / total
-    spread[1, 0], spread[2, 0], spread[2, 1] = spread[0, 1], spread[0, 2], spread[1, 2]
-    for i in range(3):
-        for j in range(3):
-            spread[i, j] -= mean[i] * mean[j]
+    put_moments(total, (s0, s1, s2), (s00, s01, s02, s11, s12, s22), mean, spread)
     flat[0], flat[1], flat[2] = f0 / window, f1 / window, plain_square / plain
     return float(np.log(total / (window * plain)) + log_uniform)
