@@ -48,7 +48,7 @@ def put_moments(
     mean: NDArray[np.float64],
     spread: NDArray[np.float64],
 ) -> None:
-    """Mean and covariance of three coordinates from sums of 1, of them and of their products, upper triangle by rows."""
+    """Mean and covariance of three coordinates from sums of 1, of them and of their products (upper triangle)."""
     for i in range(3):
         mean[i] = first[i] / total
     spread[0, 0], spread[0, 1], spread[0, 2] = second[0] / total, second[1] / total, second[2] / total
