@@ -319,6 +319,18 @@ def test_clusters_match_a_brute_force_partition():
     assert clusters.weights.sum() == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("far", [0.0, 5e-324, 1e-309, 1e-301, 1e-200])
+def test_a_cluster_of_next_to_no_weight_has_moments(far: float) -> None:
+    """Away from all measurements weights fall below what has a finite inverse."""
+    near, away = np.random.default_rng(1).normal(size=(2, 50, 3)) * 0.1
+    poses = np.concatenate([near, away + [60.0, 0.0, 1.0]])
+    clusters = find_clusters(poses, np.concatenate([np.full(50, 1 / 50), np.full(50, far)]))
+    assert len(clusters) == 2
+    np.testing.assert_allclose(clusters.means[1], away.mean(0) + [60.0, 0.0, 1.0], atol=1e-3)
+    np.testing.assert_allclose(clusters.covariances[1], np.cov(away.T, bias=True), atol=1e-3)
+
+
+
 def test_regularisation_keeps_the_moments_of_every_cluster():
     rng = np.random.default_rng(16)
     one = rng.multivariate_normal([0, 0, 3.1], [[1.0, 0.5, 0.0], [0.5, 0.6, 0.01], [0.0, 0.01, 0.01]], 6000)

@@ -11,6 +11,7 @@ from fusion.kernels.layout import BLOCK, E0, E1, E2, MOTION_STREAM, SCRATCH_SIZE
 from fusion.kernels.motion import three_normals
 
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+_LEAST_MASS = 1e-300  # below about 1e-308 one over it is infinite
 
 
 @numba.njit(**_OPTIONS)
@@ -76,14 +77,14 @@ def _directions(poses: NDArray[np.float64], sines: NDArray[np.float32], cosines:
 def moments_of(
     poses: NDArray[np.float64], weights: NDArray[np.float64], labels: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Mass (M,), mean (M, 3) and covariance (M, 3, 3) of each cluster; one without weight gets equal weights."""
+    """Mass (M,), mean (M, 3) and covariance (M, 3, 3) of each cluster; one of next to no weight gets equal weights."""
     mass, number = np.zeros(count), np.zeros(count)
     for i in range(len(poses)):
         mass[labels[i]] += weights[i]
         number[labels[i]] += 1.0
     sums, per_mass, each = np.zeros((count, 4)), np.zeros(count), np.zeros(count)
     for m in range(count):
-        if mass[m] > 0.0:
+        if mass[m] > _LEAST_MASS:
             per_mass[m] = 1.0 / mass[m]
         else:
             each[m] = 1.0 / number[m]
