@@ -75,7 +75,7 @@ def run_trial(kind: str, incident: Incident, matcher: MapMatcher, settings: Trac
         if right is not None:
             break
     scores = [estimate.lost_score for estimate in online.estimates]
-    noticed = [frame for frame in range(incident.last, len(scores)) if scores[frame] > settings.lost_threshold]
+    noticed = [frame for frame in range(incident.last, len(scores)) if scores[frame] > settings.search.lost_threshold]
     return {
         "right_after_m": right,
         "noticed_m": float(since[noticed[0]]) if noticed else None,

@@ -13,7 +13,7 @@ import numpy as np
 from fusion.arrays import Float32Array, FloatArray
 from fusion.estimate import Estimate
 from fusion.odometry import OdometryIncrement
-from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.particle_filter import ParticleFilter
 from fusion.two_level import TwoLevelLikelihood
 from learned.map_raster import MapRaster
 from learned.matcher import MapMatcher, SearchRegion
@@ -50,7 +50,7 @@ class AnywhereSearch:
     ) -> None:
         self._matcher, self._map, self._ground_z = matcher, map_raster, ground_z
         self._settings, self._rng = settings, rng
-        self._filter_settings = ParticleFilterSettings(outlier_probability=settings.outlier_probability)
+        self._filter_settings = settings.filter
         self._whole_map: WholeMapSearch | None = None
         self._cloud: StartCloud | None = None
 
@@ -105,7 +105,7 @@ class AnywhereSearch:
             grid, settings = self._map.grid, self._settings
             prior = map_box(grid) if predicted is None else GivenUp.by(predicted, grid)
             count = max(settings.particles, _LEAST_PARTICLES)
-            self._cloud = StartCloud(prior, count, settings.outlier_probability, self._rng)
+            self._cloud = StartCloud(prior, count, settings.filter.outlier_probability, self._rng)
             motion = None
         cloud, log_weights = self._cloud.add(likelihood.tempered(temperature), motion, likelihood)
         return ParticleFilter(cloud, self._rng, self._filter_settings, log_weights)

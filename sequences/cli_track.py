@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -95,6 +96,15 @@ def track(
         float, typer.Option(help="How far off the map draws things, standard deviation, metres.", metavar="M")
     ] = 0.4,
     particles: Annotated[int, typer.Option(help="How many particles the filter has.", metavar="N")] = 10_000,
+    override: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="Change a setting of the search, the filter, the smoother or the odometry's noise, as in "
+            "filter.resampler=stratified; may be repeated. A run's config.yaml lists them all.",
+            metavar="GROUP.KEY=VALUE",
+        ),
+    ] = None,
     allow_pickle: PickleOption = False,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
@@ -103,9 +113,10 @@ def track(
 
     Writes a run directory (metrics.json, report.html, trajectories) and prints the errors, when there is ground truth.
     """
+    from sequences.dotted_keys import changed
     from sequences.registry import OpenOptions, open_sequence
     from sequences.run_files import read_calibration
-    from sequences.track_settings import TrackSettings
+    from sequences.track_settings import GROUPS, TrackSettings
 
     opened = open_sequence(sequence, OpenOptions(seed, allow_pickle))
     settings = TrackSettings(
@@ -123,7 +134,8 @@ def track(
         map_check_every_m=watch_map_every,
         calibration=None if calibration is None else read_calibration(calibration),
     )
-    _run(opened, matcher, settings, out, overwrite, quiet, backend)
+    groups = changed({name: getattr(settings, name) for name in GROUPS}, override or ())
+    _run(opened, matcher, replace(settings, **groups), out, overwrite, quiet, backend)
 
 
 def view(run: Annotated[Path, typer.Argument(help="Run directory.", metavar="RUN")]) -> None:

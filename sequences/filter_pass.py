@@ -13,7 +13,7 @@ from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.graph.patch import LikelihoodPatch
 from fusion.odometry import OdometryIncrement, accumulate
-from fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from fusion.particle_filter import ParticleFilter
 from fusion.prior import UniformPrior
 from fusion.two_level import TwoLevelLikelihood
 from learned.matcher import MapMatcher, largest_half_extent_m
@@ -88,7 +88,7 @@ class FilterPass:
         self._measured_at_m = 0.0
         self._since_measured: list[OdometryIncrement] = []
         self._rng = np.random.default_rng([settings.seed, _FILTER_STREAM])
-        self._start_cloud = StartCloud(prior, settings.particles, settings.outlier_probability, self._rng)
+        self._start_cloud = StartCloud(prior, settings.particles, settings.filter.outlier_probability, self._rng)
         largest_m = largest_half_extent_m(matcher)
         if prior.half_extent_m > largest_m and not settings.start_anywhere:
             raise SkyfixError(
@@ -163,7 +163,7 @@ class FilterPass:
             return len(self._since_measured) >= self._settings.measure_every_frames
         every_m = self._settings.measure_every_m
         if self._plan.phase is Phase.ANYWHERE:
-            every_m = max(every_m, self._settings.whole_map_every_m)
+            every_m = max(every_m, self._settings.search.whole_map_every_m)
         return self._travelled_m - self._measured_at_m >= every_m
 
     def _measure_if_due(
@@ -216,9 +216,8 @@ class FilterPass:
     def _filter_from_start(self, measurement: Measurement, motion: OdometryIncrement | None) -> ParticleFilter:
         """A filter with the posterior of all measurements since the start."""
         flattened = measurement.likelihood.tempered(measurement.temperature)
-        settings = ParticleFilterSettings(outlier_probability=self._settings.outlier_probability)
         cloud, log_weights = self._start_cloud.add(flattened, motion)
-        return ParticleFilter(cloud, self._rng, settings, log_weights)
+        return ParticleFilter(cloud, self._rng, self._settings.filter, log_weights)
 
     def _update(self, particles: ParticleFilter, frame: int, measurement: Measurement) -> float:
         if isinstance(measurement.likelihood, TwoLevelLikelihood):
@@ -259,7 +258,7 @@ class FilterPass:
         if not (is_due and self._plan.follows_filter and self._prepare_whole_map(frame)):
             return
         contrast = self._anywhere.contrast(measurement.points, particles.estimate(self._stamp(frame)).pose)
-        if self._watch.record(self._travelled_m, contrast) > self._settings.lost_threshold:
+        if self._watch.record(self._travelled_m, contrast) > self._settings.search.lost_threshold:
             self._plan.give_up()
             self._note(frame, f"searching for {self._plan.phase.value}: this scan fits elsewhere")
             everywhere = self._anywhere.match(measurement.points, particles)

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fusion.factor_graph import OdometryDrift, SmootherSettings
+from fusion.factor_graph import OdometryDrift
 from fusion.odometry import OdometryIncrement, increments_at
 from fusion.trajectory import Trajectory
 from learned.matcher import MapMatcher
@@ -81,10 +81,9 @@ def track(
     )
     begin = time.perf_counter()
     seen = (drive.stamps_ns, sequence.odometry(settings.odometry), settings.noise, online.patches, prior, filtered)
-    smoother = SmootherSettings(outlier_probability=settings.outlier_probability)
-    smoothed, calibration = smooth_drive(*seen, smoother)
+    smoothed, calibration = smooth_drive(*seen, settings.smoother)
     smoothing_s = time.perf_counter() - begin
-    filter_calibration = calibrate_drive(*seen, replace(smoother, drift=OdometryDrift.steady()))
+    filter_calibration = calibrate_drive(*seen, replace(settings.smoother, drift=OdometryDrift.steady()))
     measured = sorted(online.best)
     result = RunResult(
         sequence_name=sequence.name,

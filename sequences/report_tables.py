@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sequences.dotted_keys import dotted
 from sequences.figures.series import RunSeries
 from sequences.figures.style import METHODS
 from sequences.run_result import RunResult
@@ -141,12 +142,7 @@ def stage_rows(result: RunResult) -> list[StageRow]:
 def settings_rows(result: RunResult) -> list[tuple[str, str]]:
     """Flatten the resolved settings to (name, value) lines."""
     rows = [("sequence", result.sequence_name), ("matcher", result.matcher_name)]
-    for name, value in asdict(result.settings).items():
-        if isinstance(value, dict):
-            rows += [(f"{name}.{inner}", _shown(inner_value)) for inner, inner_value in value.items()]
-        else:
-            rows.append((name, _shown(value)))
-    return rows
+    return [*rows, *((name, _shown(value)) for name, value in dotted(asdict(result.settings)).items())]
 
 
 def _shown(value: object) -> str:

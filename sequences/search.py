@@ -53,7 +53,7 @@ class SearchPlan:
     """
 
     def __init__(self, prior: UniformPrior, settings: TrackSettings, largest_half_extent_m: float = math.inf) -> None:
-        self._prior, self._settings, self._largest_m = prior, settings, largest_half_extent_m
+        self._prior, self._search, self._largest_m = prior, settings.search, largest_half_extent_m
         self._moved = np.zeros(3)  # odometry since the start, seen from the first body frame
         self._agreeing = self._disagreeing = 0
         self._lost_half_heading_rad = prior.half_heading_rad
@@ -83,10 +83,10 @@ class SearchPlan:
                 return replace(start, half_extent_m=min(start.half_extent_m, self._largest_m))
             self.phase = Phase.LOST
         assert prediction is not None  # a filter exists after the first measurement
-        sigma = self._settings.search_sigmas * np.sqrt(np.diag(prediction.covariance))
-        least_m = self._settings.search_min_half_extent_m
-        most_m = min(self._settings.search_max_half_extent_m, self._largest_m)
-        least_rad = math.radians(self._settings.search_min_half_heading_deg)
+        sigma = self._search.sigmas * np.sqrt(np.diag(prediction.covariance))
+        least_m = self._search.min_half_extent_m
+        most_m = min(self._search.max_half_extent_m, self._largest_m)
+        least_rad = math.radians(self._search.min_half_heading_deg)
         if self.phase is Phase.LOST:
             least_m, least_rad = most_m, max(least_rad, self._lost_half_heading_rad)
         return SearchRegion(
@@ -109,21 +109,21 @@ class SearchPlan:
         """
         searched = (2.0 * search.half_extent_m) ** 2 * 2.0 * search.half_heading_rad
         nats = log_evidence + math.log(searched)  # over the density of a pose anywhere in the search
-        is_lost = nats < 0.0 or lost_score > self._settings.lost_threshold
+        is_lost = nats < 0.0 or lost_score > self._search.lost_threshold
         self._agreeing = self._agreeing + 1 if nats > _AGREEMENT_NATS and not is_lost else 0
         self._disagreeing = self._disagreeing + 1 if is_lost else 0
         before = self.phase
         if before is Phase.LOST:
             self._searched_widely += 1
-        if self._agreeing >= self._settings.patience:
+        if self._agreeing >= self._search.patience:
             if before is Phase.LOST:
                 self._found_at_m = self._way_m
             self._track()
-        elif self.phase is Phase.TRACK and self._disagreeing >= self._settings.patience:
-            has_relapsed = self._way_m - self._found_at_m < self._settings.relapse_m
+        elif self.phase is Phase.TRACK and self._disagreeing >= self._search.patience:
+            has_relapsed = self._way_m - self._found_at_m < self._search.relapse_m
             self.phase = Phase.ANYWHERE if has_relapsed and self.has_whole_map else Phase.LOST
             self._searched_widely = 0
-        elif before is Phase.LOST and self._searched_widely >= self._settings.lost_patience and self.has_whole_map:
+        elif before is Phase.LOST and self._searched_widely >= self._search.lost_patience and self.has_whole_map:
             self.phase = Phase.ANYWHERE
         if self.phase is Phase.ANYWHERE:
             self._won = 0
@@ -140,7 +140,7 @@ class SearchPlan:
 
     def record_places(self, share: float) -> bool:
         """Note the likeliest place's share of the posterior after a search of the whole map; True when it has won."""
-        self._won = self._won + 1 if share >= self._settings.winner_share else 0
+        self._won = self._won + 1 if share >= self._search.winner_share else 0
         if self._won < _WINS:
             return False
         self._track()
@@ -153,7 +153,7 @@ class SearchPlan:
 
     @property
     def _widest_start_m(self) -> float:
-        return self._prior.half_extent_m + self._settings.search_margin_m + self._settings.search_start_growth_m
+        return self._prior.half_extent_m + self._search.margin_m + self._search.start_growth_m
 
     def _start_carried_along(self) -> SearchRegion:
         """The start's box and a margin, moved by the odometry and grown by what its headings leave open."""
@@ -167,6 +167,6 @@ class SearchPlan:
             growth = way_m
         return SearchRegion(
             centre=centre,
-            half_extent_m=self._prior.half_extent_m + self._settings.search_margin_m + growth,
+            half_extent_m=self._prior.half_extent_m + self._search.margin_m + growth,
             half_heading_rad=min(half_heading + _HEADING_MARGIN_RAD, math.pi),
         )

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 from fusion.errors import SkyfixError
+from fusion.factor_graph import OdometryDrift, SmootherSettings
 from fusion.odometry import OdometryNoise
 from fusion.odometry_errors import OdometryCalibration
+from fusion.particle_filter import ParticleFilterSettings
+from sequences.search_settings import SearchSettings
+
+GROUPS = ("search", "filter", "smoother", "noise")
+"""Fields of `TrackSettings` that hold settings of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,43 +40,21 @@ class TrackSettings:
         A scan is matched with the map when the odometry has moved this far since the last one that was.
     measure_every_frames
         When given, every so many frames instead.
-    search_min_half_extent_m, search_max_half_extent_m
-        Bounds of the searched square's half side about the filter's prediction.
-    search_min_half_heading_deg
-        Least half width of the searched headings.
-    search_start_growth_m
-        Until the start is settled a search covers its whole box, carried along, and what its unknown heading adds up to
-        this; see `search`.
-    search_margin_m
-        Added to the start box in the first search, so that a truth at its edge still has its surroundings.
-    search_sigmas
-        The search reaches this many standard deviations of the prediction.
     correlation_length_m
         Distance over which a matcher's errors resemble each other. None: the matcher's own.
     map_error_m
         Standard deviation, east and north alike, of where the map draws things against where they are. Neighbouring
         measurements share it, so no number of them averages it out: it is added to the covariances that are reported.
         OpenStreetMap is traced from aerial images that are a few decimetres off.
-    outlier_probability
-        Chance that a measurement says nothing about the pose.
-    lost_threshold, patience
-        A measurement agrees with the filter when it fits its prediction and leaves its lost score below the threshold.
-        The search narrows after so many in a row that do, and widens after so many that do not.
     map_check_every_m
         While the vehicle is tracked, a scan is compared with the whole map every so many metres (see `map_watch`),
         where the matcher can; 0 for never. It decides on nothing but whether the vehicle is lost, and is the only way
         to notice that it was carried to a place that looks alike; where many places do, it raises false alarms.
-    lost_patience
-        A vehicle that so many wide searches have not found again is looked for on the whole map.
-    relapse_m
-        So is one that is lost again within this distance of having been found by a wide search.
-    whole_map_every_m
-        While it is looked for on the whole map, a scan is matched every so many metres (never more often than
-        otherwise).
-    winner_share
-        It is found when one place holds this share of the posterior, twice in a row.
     snapshots
         Measured frames kept for the report.
+    search, filter, smoother
+        Where scans are looked for; the particle filter, whose outlier probability the start's search has too; the
+        smoother, whose drift is found from the drive and is none here.
     noise
         The odometry's noise, standard deviations that grow with the root of the distance.
     calibration
@@ -87,23 +71,13 @@ class TrackSettings:
     start_anywhere: bool = False
     measure_every_m: float = 4.0
     measure_every_frames: int | None = None
-    search_min_half_extent_m: float = 12.0
-    search_max_half_extent_m: float = 24.0
-    search_min_half_heading_deg: float = 6.0
-    search_margin_m: float = 2.0
-    search_start_growth_m: float = 40.0
-    search_sigmas: float = 3.5
     correlation_length_m: float | None = None
     map_error_m: float = 0.4
-    outlier_probability: float = 0.05
-    lost_threshold: float = 0.5
-    patience: int = 3
     map_check_every_m: float = 0.0
-    lost_patience: int = 3
-    relapse_m: float = 50.0
-    whole_map_every_m: float = 8.0
-    winner_share: float = 0.9
     snapshots: int = 6
+    search: SearchSettings = field(default_factory=SearchSettings)
+    filter: ParticleFilterSettings = field(default_factory=ParticleFilterSettings)
+    smoother: SmootherSettings = field(default_factory=SmootherSettings)
     noise: OdometryNoise = field(default_factory=OdometryNoise)
     calibration: OdometryCalibration | None = None
 
@@ -113,34 +87,23 @@ class TrackSettings:
             numbers = value if isinstance(value, tuple) else (value,)
             if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
                 raise SkyfixError(f"{entry.name}: expected a finite number, got {value}")
-        positive = ("particles", "half_extent_m", "half_heading_deg", "patience", "search_sigmas")
-        lengths = ("search_min_half_extent_m", "search_max_half_extent_m", "search_min_half_heading_deg")
-        for name in (*positive, "lost_patience", *lengths):
+        for name in ("particles", "half_extent_m", "half_heading_deg"):
             if getattr(self, name) <= 0:
                 raise SkyfixError(f"{name}: expected more than 0, got {getattr(self, name)}")
         if self.half_heading_deg > 180.0:
             raise SkyfixError(f"half_heading_deg: expected at most 180, got {self.half_heading_deg:g}")
         if self.measure_every_frames is not None and self.measure_every_frames < 1:
             raise SkyfixError(f"measure_every_frames: expected 1 or more, got {self.measure_every_frames}")
-        for name in (
-            "measure_every_m",
-            "search_margin_m",
-            "search_start_growth_m",
-            "map_error_m",
-            "correlation_length_m",
-            "map_check_every_m",
-            "relapse_m",
-            "whole_map_every_m",
-            "snapshots",
-        ):
+        for name in ("measure_every_m", "map_error_m", "correlation_length_m", "map_check_every_m", "snapshots"):
             if (getattr(self, name) or 0) < 0:
                 raise SkyfixError(f"{name}: expected 0 or more, got {getattr(self, name):g}")
-        if not 0.5 < self.winner_share < 1.0:
-            raise SkyfixError(f"winner_share: expected above 0.5 and below 1, got {self.winner_share:g}")
         if self.start_anywhere and self.start is not None:
             raise SkyfixError(f"start: expected none with start_anywhere, got {self.start}")
         if self.seed < 0:
             raise SkyfixError(f"seed: expected 0 or more, got {self.seed}")
+        if self.smoother.drift is not None:
+            raise SkyfixError("smoother drift: expected none, it is found from the drive")
+        replace(self.smoother, drift=OdometryDrift())  # is checked
 
     @property
     def heading_unknown(self) -> bool:

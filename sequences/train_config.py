@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from fusion.errors import SkyfixError
 from learned.samples import SAMPLE_METRES_PER_PIXEL
 from learned.training import TrainingSettings
+from sequences.dotted_keys import dotted, split_override
 from sequences.training_data import SimulationSettings
 
 RESOLVED_FILE = "config.yaml"
@@ -137,7 +138,7 @@ def write_config(config: TrainConfig, path: Path) -> None:
 
 def first_difference(one: TrainConfig, other: TrainConfig) -> tuple[str, Any, Any] | None:
     """A key that decides on the result and differs, with both values; None if there is none."""
-    a, b = (_flat(config.model_dump(mode="json")) for config in (one, other))
+    a, b = (dotted(config.model_dump(mode="json")) for config in (one, other))
     for key in [*a, *(key for key in b if key not in a)]:
         if key not in _FREE_KEYS and a.get(key) != b.get(key):
             return key, a.get(key), b.get(key)
@@ -145,24 +146,10 @@ def first_difference(one: TrainConfig, other: TrainConfig) -> tuple[str, Any, An
 
 
 def _override(content: dict[str, Any], override: str) -> None:
-    path, separator, text = override.partition("=")
-    keys = path.strip().split(".")
-    if not separator or not all(keys):
-        raise SkyfixError(f"--set: expected KEY.KEY=VALUE, got {override!r}")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise SkyfixError(f"--set {path}: expected a YAML value, got {text!r}") from error
+    keys, value = split_override(override)
     inner = content
     for key in keys[:-1]:
         inner = inner.setdefault(key, {})
         if not isinstance(inner, dict):
-            raise SkyfixError(f"--set {path}: expected a mapping at {key}, got {inner!r}")
+            raise SkyfixError(f"--set {'.'.join(keys)}: expected a mapping at {key}, got {inner!r}")
     inner[keys[-1]] = value
-
-
-def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in content.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat

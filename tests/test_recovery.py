@@ -30,10 +30,11 @@ from sequences.localize import track
 from sequences.map_watch import MapWatch
 from sequences.run_result import RunResult
 from sequences.search import Phase, SearchPlan
+from sequences.search_settings import SearchSettings
 from sequences.track_settings import TrackSettings
 
 SETTINGS = TrackSettings(
-    "spliced", seed=1, particles=1500, snapshots=2, search_max_half_extent_m=12.0, map_check_every_m=4.0
+    "spliced", seed=1, particles=1500, snapshots=2, search=SearchSettings(max_half_extent_m=12.0), map_check_every_m=4.0
 )
 SIDE, TURN, BINS = 3, 5, 24
 SIGMA = np.array([0.7, 0.7, np.deg2rad(3.0)])
@@ -227,7 +228,7 @@ def test_settings_of_a_start_anywhere_are_checked() -> None:
     with pytest.raises(SkyfixError, match="start: expected none with start_anywhere"):
         TrackSettings("wheels", start=(0.0, 0.0, 0.0), start_anywhere=True)
     with pytest.raises(SkyfixError, match="winner_share: expected above"):
-        TrackSettings("wheels", winner_share=1.0)
+        SearchSettings(winner_share=1.0)
     with pytest.raises(SkyfixError, match="map_check_every_m: expected 0 or more"):
         TrackSettings("wheels", map_check_every_m=-1.0)
 

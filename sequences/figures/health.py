@@ -31,7 +31,7 @@ def health_figure(result: RunResult, series: RunSeries) -> Figure:
 
     lost.plot(distance_m, [row.lost_score for row in rows], ".-", ms=1.5, lw=1.1, color=METHODS["odometry"].colour)
     lost.set_ylim(-0.04, 1.05)
-    threshold = result.settings.lost_threshold
+    threshold = result.settings.search.lost_threshold
     lost.axhline(threshold, color=INK, lw=0.8, ls=":")
     tidy(lost, title=f"Lost score (dotted: {threshold:g}, above which the search widens)", x="distance travelled (m)")
     _mark_skipped(lost, series, rows)

@@ -1,0 +1,82 @@
+"""Keys of nested settings as dotted paths: KEY.KEY=VALUE as `--set` takes it, and settings listed by such keys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from fusion.errors import SkyfixError
+
+Settings = TypeVar("Settings")
+
+
+def split_override(override: str) -> tuple[list[str], Any]:
+    """Keys and value of "KEY.KEY=VALUE", the value as in YAML; SkyfixError if it is not that."""
+    path, separator, text = override.partition("=")
+    keys = [key.strip() for key in path.split(".")]
+    if not separator or not all(keys):
+        raise SkyfixError(f"--set: expected KEY.KEY=VALUE, got {override!r}")
+    try:
+        return keys, yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise SkyfixError(f"--set {path}: expected a YAML value, got {text!r}") from error
+
+
+def dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one mapping of dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in content.items():
+        flat |= dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+def changed(groups: Mapping[str, Settings], overrides: Iterable[str]) -> dict[str, Settings]:
+    """Groups of settings with some of their values replaced.
+
+    Parameters
+    ----------
+    groups
+        Name -> frozen dataclass, which checks itself.
+    overrides
+        "GROUP.KEY=VALUE" each. A KEY may itself hold settings: "GROUP.KEY.KEY=VALUE", where what was None so far
+        begins with its defaults, or "GROUP.KEY={...}" for several at once, the others at their defaults.
+
+    Raises
+    ------
+    SkyfixError
+        If a key is unknown, or a value has the wrong type or is out of range.
+    """
+    content = dict(groups)
+    for override in overrides:
+        (name, *keys), value = split_override(override)
+        shown = f"--set {override}"
+        if name not in content or not keys:
+            raise SkyfixError(f"{shown}: expected one of {', '.join(f'{group}.KEY=VALUE' for group in content)}")
+        try:
+            content[name] = _replaced(content[name], keys, value)
+        except ValidationError as error:
+            raise SkyfixError(f"{shown}: {error.errors()[0]['msg']}") from error
+        except SkyfixError as error:
+            raise SkyfixError(f"{shown}: {error}") from error
+    return content
+
+
+def _replaced(settings: Any, keys: list[str], value: Any) -> Any:
+    key, *inner = keys
+    names = [entry.name for entry in fields(settings)]
+    if key not in names:
+        raise SkyfixError(f"expected one of {', '.join(names)}, got {key!r}")
+    expected = get_type_hints(type(settings))[key]
+    if not inner:
+        return replace(settings, **{key: TypeAdapter(expected).validate_python(value)})
+    kinds: list[Any] = [kind for kind in get_args(expected) if is_dataclass(kind)]
+    group = getattr(settings, key)
+    if group is None and kinds:
+        group = kinds[0]()
+    if not is_dataclass(group):
+        raise SkyfixError(f"expected a value for {key}, which holds no settings, got {'.'.join(inner)}")
+    return replace(settings, **{key: _replaced(group, inner, value)})
