@@ -30,7 +30,7 @@ def test_every_setting_can_be_written_as_it_is(key: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "key, value",
+    ("key", "value"),
     [
         ("filter.resampler", "residual"),
         ("filter.guided_share", 0.25),
@@ -54,7 +54,7 @@ def test_what_was_none_begins_with_its_defaults_and_goes_on_from_there() -> None
 
 
 @pytest.mark.parametrize(
-    "override, expected",
+    ("override", "expected"),
     [
         ("filter.resampler=wheel", "resampler: expected one of systematic.*got 'wheel'"),
         ("filter.threads=two", "valid integer"),

@@ -298,6 +298,7 @@ def test_a_run_directory_holds_the_run(made_drive: MadeDrive, tmp_path: Path) ->
     config = yaml.safe_load((out / "config.yaml").read_text())
     assert (config["seed"], config["odometry"], config["matcher"]) == (3, "wheels", "emulated")
     assert config["noise"]["longitudinal_m_per_sqrt_m"] == result.settings.noise.longitudinal_m_per_sqrt_m
+    assert (config["filter"]["resampler"], config["search"]["patience"]) == ("systematic", 3)
     with (out / "frames.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 30

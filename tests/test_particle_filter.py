@@ -330,7 +330,6 @@ def test_a_cluster_of_next_to_no_weight_has_moments(far: float) -> None:
     np.testing.assert_allclose(clusters.covariances[1], np.cov(away.T, bias=True), atol=1e-3)
 
 
-
 def test_regularisation_keeps_the_moments_of_every_cluster():
     rng = np.random.default_rng(16)
     one = rng.multivariate_normal([0, 0, 3.1], [[1.0, 0.5, 0.0], [0.5, 0.6, 0.01], [0.0, 0.01, 0.01]], 6000)
