@@ -46,7 +46,7 @@ def as_usual(drive: MadeDrive) -> RunResult:
         "filter.adaptive={least: 1000, most: 20000}",
         "filter.guided_share=0.3",
         "filter.outlier_probability=0.2",
-        "search.sigmas=2",
+        "search.min_half_extent_m=8",
         "smoother.odometry_kernel=none",
         "noise.longitudinal_m_per_sqrt_m=0.2",
     ],
