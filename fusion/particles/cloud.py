@@ -238,17 +238,18 @@ class Cloud:
         return self._summary(sums, weigh, look)
 
     def _go_on(self, motion: list[float]) -> None:
-        """Move the reference pose along, and the anchor when the cloud has left it behind."""
+        """Move the reference pose along, and the anchor when the cloud has left it behind.
+
+        The anchor moves with the cloud only: whoever looks at a cloud that has been resampled finds the moments that
+        are known already relative to the same anchor.
+        """
         x, y, yaw = self._reference
         dx, dy, turn = motion[at.DELTA : at.DELTA + 3]
-        if abs(x) > _REACH_M or abs(y) > _REACH_M:
+        if motion[at.MOVED] > 0.0 and (abs(x) > _REACH_M or abs(y) > _REACH_M):
             east, north = (float(round(at)) if abs(at) > _REACH_M else 0.0 for at in (x, y))
             motion[at.SHIFT : at.SHIFT + 2] = east, north
             self._anchor = (self._anchor[0] + east, self._anchor[1] + north)
             x, y = x - east, y - north
-            if self._moments is not None:
-                mean = self._moments.mean
-                self._moments = self._moments._replace(mean=(mean[0] - east, mean[1] - north, mean[2]))
         along, across = cos(yaw), sin(yaw)
         self._reference = (x + along * dx - across * dy, y + across * dx + along * dy, wrapped(yaw + turn))
 
