@@ -104,7 +104,7 @@ def _sparse_components(cell_of: IntArray, cols: int) -> tuple[IntArray, int]:
 
 
 def find_clusters(poses: FloatArray, weights: FloatArray) -> Clusters:
-    """Partition poses (N, 3) with non-negative weights (N,) that sum to 1; a cluster of less than 1e-300 gets equal weights."""
+    """Partition poses (N, 3) with non-negative weights (N,) that sum to 1; clusters below 1e-300 get equal ones."""
     poses, weights = np.ascontiguousarray(poses), np.ascontiguousarray(weights)
     labels, count = _labels(poses)
     return Clusters(labels, *moments_of(poses, weights, labels, count))
