@@ -40,6 +40,8 @@ from fusion.resampling import RESAMPLERS
 
 __all__ = ["ParticleFilter", "ParticleFilterSettings", "ParticleFilterState"]
 
+_MISSED_NATS = -1.0  # of evidence against a random pose, where particles have missed a likelihood or are lost
+
 
 class ParticleFilter:
     """Weighted particles over (x, y, yaw) in the map frame.
@@ -199,7 +201,12 @@ class ParticleFilter:
             size = self._cloud.moments().effective_sample_size
             return UpdateReport(self._log_evidence, size, lost_score=self._lost, used=False)
         log_uniform = log_uniform_evidence(likelihood, settings.outlier_probability)
-        self._log_evidence = log_evidence = self._weigh(likelihood, temperature)
+        log_evidence = self._weigh(likelihood, temperature)
+        if self._is_missed(log_evidence - log_uniform):
+            log_evidence = self._weigh_guided(
+                likelihood.tempered(temperature).with_outliers(settings.outlier_probability)
+            )
+        self._log_evidence = log_evidence
         self._travelled_m = self._turned_rad = 0.0
         log_odds = self._lost_model.log_odds(self._lost, log_evidence, log_uniform)
         self._lost = probability(log_odds)
@@ -242,8 +249,6 @@ class ParticleFilter:
     def _weigh(self, likelihood: PoseLikelihood, temperature: float) -> float:
         """Weigh the cloud, in one pass when the likelihood can be looked up, and give the log evidence."""
         checked_temperature(temperature)
-        if self.settings.guided_share > 0.0:
-            return self._weigh_guided(likelihood.tempered(temperature).with_outliers(self.settings.outlier_probability))
         mixture = likelihood.with_outliers(self.settings.outlier_probability)
         if isinstance(mixture, OutlierMixture):
             lookup = lookup_of(mixture.likelihood, temperature, self._cloud.poses)
@@ -255,8 +260,15 @@ class ParticleFilter:
             raise SkyfixError(f"likelihood: expected {len(self._cloud)} finite log densities, got others")
         return self._cloud.add_log_likelihood(log_likelihood)
 
+    def _is_missed(self, nats: float) -> bool:
+        """Whether too few particles are where the measurement says, which gave them `nats` more than a random pose."""
+        least = self.settings.guided_below if self.settings.guided_share > 0.0 else 0.0
+        return self._cloud.moments().effective_sample_size < least or (least > 0.0 and nats < _MISSED_NATS)
+
     def _weigh_guided(self, measurement: PoseLikelihood) -> float:
-        """Replace the prediction by draws from it and from the measurement, weighed; the log evidence."""
+        """Take back what a measurement has done to the weights, replace the cloud by draws from it and from the
+        measurement, weigh these and give the log evidence."""
+        self._cloud.add_log_likelihood(-measurement.log_density(self._cloud.poses()))
         predicted = LatticeDensity.of(self._cloud.poses(), self._cloud.log_weights())
         count = len(self._cloud)
         poses, log_weights = guided(predicted, measurement, count, self.settings.guided_share, self._rng)

@@ -143,7 +143,7 @@ def test_guided_filters_find_a_sharp_measurement_that_plain_ones_miss():
     sharp, motion = np.diag([0.03, 0.03, 0.005]) ** 2, OdometryIncrement(1, np.zeros(3), np.diag([0.1, 0.1, 0.01]) ** 2)
     errors = {}
     for share in (0.0, 0.3):
-        settings = ParticleFilterSettings(guided_share=share, injection_share=0.0)
+        settings = ParticleFilterSettings(guided_share=share, injection_share=0.0)  # whose particles have missed
         particles = ParticleFilter(cloud, 5, settings)
         particles.predict(motion)
         report = particles.update(at([2.0, -1.0, 0.2], sharp))
@@ -151,6 +151,57 @@ def test_guided_filters_find_a_sharp_measurement_that_plain_ones_miss():
     assert report.effective_sample_size > 30.0
     assert errors[0.3] < 0.05
     assert errors[0.0] > 1.0
+
+
+def test_a_cloud_is_drawn_anew_only_where_it_is_too_thin():
+    """The predicted particles stay in place unless a measurement leaves few of them, or fits none."""
+    cloud = np.random.default_rng(5).normal([0.0, 0.0, 0.0], [2.0, 2.0, 0.2], (1000, 3))
+    cases = {"broad": (np.eye(3), 0.0), "sharp": (np.diag([0.05, 0.05, 0.01]) ** 2, 0.0), "away": (MEASURED, 9.0)}
+    moved = {}
+    for name, (covariance, x) in cases.items():
+        for below in (0.0, 50.0, np.inf):
+            settings = ParticleFilterSettings(ess_fraction=0.0, injection_share=0.0, guided_below=below)
+            particles = ParticleFilter(cloud, 5, settings)
+            particles.update(at([x, 0.0, 0.0], covariance))
+            moved[name, below] = np.abs(particles.particles - cloud).max() > 1e-4
+    assert {key for key, value in moved.items() if value} == {
+        ("sharp", 50.0), ("away", 50.0), ("broad", np.inf), ("sharp", np.inf), ("away", np.inf),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("below", [50.0, np.inf])
+def test_evidence_of_a_cloud_drawn_anew_is_that_of_the_prediction(below):
+    """Against many particles: the density of a sharp measurement under a wide prediction, in closed form."""
+    sharp, spread = np.diag([0.05, 0.05, 0.01]) ** 2, np.diag([2.0, 2.0, 0.2]) ** 2
+    expected = np.log(0.95) - 0.5 * np.log(np.linalg.det(2 * np.pi * (sharp + spread)))
+    evidences = []
+    for seed in range(30):
+        cloud = np.random.default_rng(seed).multivariate_normal(np.zeros(3), spread, 1000)
+        settings = ParticleFilterSettings(guided_below=below)
+        evidences.append(ParticleFilter(cloud, seed, settings).update(at(np.zeros(3), sharp)).log_evidence)
+    assert np.std(evidences) < 0.3
+    assert np.mean(evidences) == pytest.approx(expected, abs=0.2)  # the kernel's width widens the prediction
+
+
+def test_a_likelihood_of_nonsense_leaves_the_cloud_as_it_was():
+    class Sharp(GaussianLikelihood):
+        def with_outliers(self, probability):
+            return self
+
+        def tempered(self, temperature):
+            return self
+
+        def draw_log_density(self, poses):
+            return np.full(len(poses), np.nan)
+
+    cloud = np.random.default_rng(6).normal([0.0, 0.0, 0.0], [2.0, 2.0, 0.2], (500, 3))
+    particles = ParticleFilter(cloud, 5)
+    before = particles.estimate(0)
+    with pytest.raises(SkyfixError, match="expected 500 finite log densities"):
+        particles.update(Sharp(np.zeros(3), np.diag([0.05, 0.05, 0.01]) ** 2, GRID))
+    np.testing.assert_allclose(particles.particles, cloud, atol=1e-5)
+    np.testing.assert_allclose(particles.log_weights, -np.log(500), atol=1e-3)
+    np.testing.assert_allclose(particles.estimate(0).covariance, before.covariance, rtol=1e-2)
 
 
 def test_measurements_while_standing_still_are_left_out():
@@ -212,6 +263,7 @@ def test_unbiased_covariance_of_a_weighted_cloud():
         ("confidence", lambda: KldSampling(confidence=0.5)),
         ("cell_m", lambda: KldSampling(cell_m=np.nan)),
         ("guided_share", lambda: ParticleFilterSettings(guided_share=1.0)),
+        ("guided_below", lambda: ParticleFilterSettings(guided_below=float("nan"))),
         ("standstill_m", lambda: ParticleFilterSettings(standstill_m=-1.0)),
         ("threads", lambda: ParticleFilterSettings(threads=0)),
         ("at least one", lambda: ParticleFilter.from_map(GRID, 0, 0)),

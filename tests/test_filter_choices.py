@@ -44,7 +44,7 @@ def as_usual(drive: MadeDrive) -> RunResult:
     [
         "filter.resampler=residual",
         "filter.adaptive={least: 1000, most: 20000}",
-        "filter.guided_share=0.3",
+        "filter.guided_below=.inf",
         "filter.outlier_probability=0.2",
         "search.min_half_extent_m=8",
         "smoother.odometry_kernel=none",
@@ -60,7 +60,7 @@ def test_each_choice_tracks_the_drive_and_changes_it(drive: MadeDrive, as_usual:
     assert not np.array_equal(getattr(chosen, changes).poses, getattr(as_usual, changes).poses)
 
 
-@pytest.mark.parametrize("override", ["filter.guided_share=0.3", "filter.adaptive={}"])
+@pytest.mark.parametrize("override", ["filter.guided_below=.inf", "filter.adaptive={}"])
 def test_real_scans_with_a_guided_and_an_adaptive_cloud(shared_data: Callable[[str], Path], override: str) -> None:
     """Sharp likelihoods whose clouds hold weights too small for an inverse."""
     settings = with_choices(TrackSettings("lidar_gicp", seed=0), override)

@@ -173,7 +173,8 @@ def test_without_injection_the_filter_still_says_that_it_is_lost():
 
 
 def test_injected_particles_carry_the_weight_of_being_lost():
-    particles = ParticleFilter(np.tile([-12.0, -12.0, 0.1], (2000, 1)), 6, ParticleFilterSettings(regularisation=0.0))
+    settings = ParticleFilterSettings(regularisation=0.0, guided_below=0.0)
+    particles = ParticleFilter(np.tile([-12.0, -12.0, 0.1], (2000, 1)), 6, settings)
     likelihood = mapped([9.0, 8.0, -2.0])
     report = particles.update(likelihood)
     while not report.injected:

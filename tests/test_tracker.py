@@ -20,7 +20,7 @@ from fusion import (
     UniformPrior,
     se2,
 )
-from fusion.consistency import correlated_error_temperature, nees
+from fusion.consistency import nees
 
 PRIOR = UniformPrior(np.zeros(3), 5.0, 0.3)
 
@@ -34,7 +34,9 @@ def tracker(particles: int = 300, seed: int = 0, **changed: float) -> Tracker:
 
 
 def test_it_follows_a_drive_whose_odometry_drifts():
-    """Mean NEES over 5 drives at 4 times each; 3 degrees of freedom, correlated, so the band is wide."""
+    """Mean NEES over 5 drives at 4 times each: the likelihoods' errors are independent, the tracker takes them for
+    correlated over 6 m and claims about twice the variance, 1.5 instead of 3; few and correlated, so the band is wide.
+    """
     errors, covariances = [], []
     for seed in range(5):
         one = tracker(seed=seed)
@@ -47,7 +49,7 @@ def test_it_follows_a_drive_whose_odometry_drifts():
                 covariances.append(estimate.covariance)
     errors = np.array(errors)
     assert np.linalg.norm(errors[:, :2], axis=1).mean() < 0.5
-    assert 1.5 < nees(errors, np.array(covariances)).mean() < 5.0
+    assert 0.9 < nees(errors, np.array(covariances)).mean() < 5.0
     assert one.estimate().lost_score < 0.05
 
 
@@ -80,7 +82,7 @@ def test_temperature_comes_from_the_distance_since_the_last_measurement_also_aft
     (between,) = feed(one, [measured[5]])
     assert [m.stamp_ns for m in between.measured] == [measured[5].stamp_ns, measured[6].stamp_ns]
     nearer = [m.temperature for m in between.measured]
-    assert 1.0 < alone < correlated_error_temperature(10.1, 6.0)
+    assert 1.0 < alone < 1.0 / (1.0 - 2.0 * np.exp(-10.1 / 6.0))  # a prediction is no surer than the first measurement
     assert nearer[0] > 1.3 * alone
     assert nearer[1] != alone
     in_order = tracker(correlation_length_m=6.0)

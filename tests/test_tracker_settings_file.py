@@ -40,6 +40,7 @@ def filter_settings(resampler: str) -> ParticleFilterSettings:
         collapse_log_evidence_margin=2.0,
         injection_share=0.2,
         guided_share=0.3,
+        guided_below=20.0,
         adaptive=KldSampling(150, 600, 0.05, 0.95, 0.4, 0.1),
         standstill_m=0.01,
         standstill_rad=0.001,

@@ -44,6 +44,6 @@ def guided(
     if from_measurement:
         poses = np.concatenate([poses, measurement.sample(from_measurement, rng)])
     log_p, log_q = predicted.log_density(poses), measurement.draw_log_density(poses)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # whoever asked looks at the weights
         log_proposal = np.logaddexp(np.log1p(-a) + log_p, np.log(a) + log_q)
     return poses, log_p + measurement.log_density(poses) - log_proposal

@@ -32,10 +32,11 @@ class ParticleFilterSettings:
         Inject particles when being lost is ahead of being on track by this many nats.
     injection_share : float
         Share of the particles that is injected then, in [0, 1); 0 switches recovery off.
-    guided_share : float
-        Share of the particles drawn from each measurement instead of the prediction, in [0, 1); see
-        `fusion.particles.guided_proposal`. For measurements much sharper than the prediction; costs far more than a
-        plain step.
+    guided_share, guided_below : float
+        A measurement that would leave fewer than `guided_below` effective particles (>= 0; infinity: any), or that all
+        particles seem to have missed, is weighed again, with this share of the particles, in [0, 1), drawn from it
+        instead of the prediction; see `fusion.particles.guided_proposal`. So a thousand particles stand a start known
+        to 20 m and a likelihood sharp to decimetres. It costs far more than a plain step. Either at 0: never.
     adaptive : KldSampling or None
         Choose the number of particles anew at every measurement, which then always resamples.
     standstill_m, standstill_rad : float
@@ -60,7 +61,8 @@ class ParticleFilterSettings:
     recovery_probability: float = 0.1
     collapse_log_evidence_margin: float = 1.0
     injection_share: float = 0.25
-    guided_share: float = 0.0
+    guided_share: float = 0.5
+    guided_below: float = 50.0
     adaptive: KldSampling | None = None
     standstill_m: float = 0.0
     standstill_rad: float = 0.0
@@ -84,6 +86,8 @@ class ParticleFilterSettings:
         for name in ("standstill_m", "standstill_rad"):
             if not (isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise SkyfixError(f"{name}: expected >= 0, got {getattr(self, name)}")
+        if not self.guided_below >= 0.0:
+            raise SkyfixError(f"guided_below: expected >= 0, got {self.guided_below}")
         if not isfinite(self.collapse_log_evidence_margin):
             raise SkyfixError(
                 f"collapse_log_evidence_margin: expected a number, got {self.collapse_log_evidence_margin}"
