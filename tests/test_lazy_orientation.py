@@ -89,7 +89,7 @@ def test_tempered_it_is_the_whole_maps_tempered(lazy, temperature):
 @pytest.mark.parametrize("temperature", [0.5, 1.5, 3.0])
 def test_tempered_it_leaves_out_the_pixels_that_hold_no_mass(asked, temperature):
     """A filter's step and draws on a peaked map of 10,000 pixels: those around the particles and under the peak."""
-    particles = ParticleFilter(near_the_peak(200)[:200], 3)
+    particles = ParticleFilter(near_the_peak(200)[:200], 3, ParticleFilterSettings(guided_below=0.0))
     particles.update(SHARP, temperature)
     likelihood = SHARP.tempered(temperature)
     likelihood.log_density(near_the_peak(200)[:200])
