@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusion import LazyOrientation, MapGrid, OdometryIncrement, ParticleFilter, SkyfixError
+from fusion import LazyOrientation, MapGrid, OdometryIncrement, ParticleFilter, ParticleFilterSettings, SkyfixError
 
 GRID = MapGrid(31, 27, 0.5, -7.0, 2.0)
 RNG = np.random.default_rng(0)
