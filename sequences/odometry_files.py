@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
-from sequences.trajectory_io import read_tum
+from sequences.trajectory_io import read_odometry
 
 
 class OdometryFiles:
@@ -28,7 +28,7 @@ class OdometryFiles:
         self._label = label
         self._readers: dict[str, Callable[[], Trajectory]] = dict(made or {})
         for file in folder.glob("odometry/*.tum"):
-            self._readers[file.stem] = partial(read_tum, file, file.stem)
+            self._readers[file.stem] = partial(read_odometry, file, file.stem)
 
     @property
     def names(self) -> tuple[str, ...]:

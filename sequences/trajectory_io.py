@@ -13,16 +13,19 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
+from sequences.odometry_axes import on_the_ground, planar
 
 _NS_PER_S = 1_000_000_000
 _TUM_COLUMNS = 8
 
 
 def read_tum(path: Path, frame_id: str = "map") -> Trajectory:
-    """Read a TUM file.
+    """Read a TUM file of a body with x forward, in a frame with z up.
 
     Parameters
     ----------
@@ -37,22 +40,20 @@ def read_tum(path: Path, frame_id: str = "map") -> Trajectory:
         If the file is missing, empty or unreadable, a line is not eight finite numbers, a quaternion has no length,
         or a stamp does not increase. The message names the file and the line.
     """
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, fields in _lines(path):
-        if len(fields) != _TUM_COLUMNS:
-            raise SkyfixError(
-                f"{path.name}: line {number}: expected 8 numbers (t x y z qx qy qz qw), got {len(fields)}"
-            )
-        stamps.append(_stamp(fields[0], path, number, stamps))
-        rows.append([_number(field, path, number) for field in fields[1:]])
-        if np.linalg.norm(rows[-1][3:]) < 1e-6:
-            raise SkyfixError(f"{path.name}: line {number}: expected a unit quaternion, got zero length")
-    if not stamps:
-        raise SkyfixError(f"{path.name}: expected at least one pose, got none")
-    values = np.array(rows, dtype=np.float64)
-    poses = np.column_stack([values[:, 0], values[:, 1], _yaw(values[:, 3:])])
-    return Trajectory(np.array(stamps, dtype=np.int64), poses, None, frame_id)
+    stamps, positions, rotations = _read_poses(path)
+    return Trajectory(stamps, on_the_ground(positions, rotations), None, frame_id)
+
+
+def read_odometry(path: Path, name: str) -> Trajectory:
+    """Read a TUM file in a frame of its own, of a body or of a camera; see `sequences.odometry_axes`.
+
+    Raises
+    ------
+    SkyfixError
+        As `read_tum` does, and if the axes are neither a body's nor a camera's.
+    """
+    stamps, positions, rotations = _read_poses(path)
+    return Trajectory(stamps, planar(positions, rotations, name), None, name)
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -80,6 +81,25 @@ def format_seconds(stamp_ns: int) -> str:
     """Nanoseconds as exact decimal seconds with nine digits."""
     sign, magnitude = ("-" if stamp_ns < 0 else ""), abs(stamp_ns)
     return f"{sign}{magnitude // _NS_PER_S}.{magnitude % _NS_PER_S:09d}"
+
+
+def _read_poses(path: Path) -> tuple[NDArray[np.int64], FloatArray, Rotation]:
+    """Stamps (N,), positions (N, 3) and N rotations of a TUM file."""
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, fields in _lines(path):
+        if len(fields) != _TUM_COLUMNS:
+            raise SkyfixError(
+                f"{path.name}: line {number}: expected 8 numbers (t x y z qx qy qz qw), got {len(fields)}"
+            )
+        stamps.append(_stamp(fields[0], path, number, stamps))
+        rows.append([_number(field, path, number) for field in fields[1:]])
+        if np.linalg.norm(rows[-1][3:]) < 1e-6:
+            raise SkyfixError(f"{path.name}: line {number}: expected a unit quaternion, got zero length")
+    if not stamps:
+        raise SkyfixError(f"{path.name}: expected at least one pose, got none")
+    values = np.array(rows, dtype=np.float64)
+    return np.array(stamps, dtype=np.int64), values[:, :3], Rotation.from_quat(values[:, 3:])
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -111,9 +131,3 @@ def _number(field: str, path: Path, number: int) -> float:
     if not np.isfinite(value):
         raise SkyfixError(f"{path.name}: line {number}: expected a finite number, got {field}")
     return value
-
-
-def _yaw(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Yaw (N,) in [-pi, pi] of quaternions (N, 4) ordered x, y, z, w, of any length above zero."""
-    x, y, z, w = quaternions.T / np.linalg.norm(quaternions, axis=1)
-    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

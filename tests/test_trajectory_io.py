@@ -1,6 +1,7 @@
 """TUM files: exact stamps, yaw from any quaternion, and errors that name file and line."""
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -54,10 +55,11 @@ def test_seconds_are_written_exactly(stamp_ns: int) -> None:
 
 @given(yaw=st.floats(-3.1, 3.1), scale=st.floats(0.1, 10.0), sign=st.sampled_from([-1.0, 1.0]))
 def test_yaw_comes_from_a_quaternion_of_any_length_and_sign(yaw: float, scale: float, sign: float) -> None:
-    from sequences.trajectory_io import _yaw
-
-    quaternion = np.array([[0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]]) * scale * sign
-    assert _yaw(quaternion)[0] == pytest.approx(yaw, abs=1e-9)
+    x, y, z, w = (value * scale * sign for value in (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)))
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "t.tum"
+        file.write_text(f"0 1 2 3 {x} {y} {z} {w}\n")
+        assert read_tum(file).poses[0, 2] == pytest.approx(yaw, abs=1e-9)
 
 
 def test_yaw_of_a_tilted_vehicle_is_that_of_its_nose(tmp_path: Path) -> None:
