@@ -17,6 +17,7 @@ from fusion.errors import SkyfixError
 from sequences.cli_ablate import ablate
 from sequences.cli_emulate import emulate
 from sequences.cli_evaluate import evaluate
+from sequences.cli_map import draw_map
 from sequences.cli_options import JsonOption, PickleOption, SeedOption, write_json
 from sequences.cli_retrieve import retrieve
 from sequences.cli_track import demo, track, view
@@ -73,6 +74,11 @@ app.command(
 app.command(epilog="Example: `skyfix retrieve drives/kitti_360 --index maps/karlsruhe.npz --places places.csv`")(
     retrieve
 )
+
+app.command(
+    "map",
+    epilog="Example: `skyfix map karlsruhe.osm.pbf drives/mine --origin 49.0116 8.4169 --half-extent 800`",
+)(draw_map)
 
 
 @app.command(epilog="Example: `skyfix convert KITTI/raw_data/2011_09_26/2011_09_26_drive_0013_sync drives/kitti_13`")

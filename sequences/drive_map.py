@@ -27,14 +27,14 @@ from fusion.grid import MapGrid
 from learned.map_raster import MapRaster
 from sequences.aerial_mosaic import mosaic
 from sequences.map_source import MAP_FILE, read_json, read_map
-from sequences.osm import local_projection, rasterise, read_osm
+from sequences.osm import MapFeatures, local_projection, rasterise, read_osm
 from sequences.satellite import read_satellite_image
 
 OSM_METRES_PER_PIXEL = 0.5
 OSM_MARGIN_M = 100.0
 """Map around the drive: the protocol's crop reaches 64 m around a start that is up to 28 m off."""
 _EXTRACTS = ("*.osm.pbf", "*.osm.gz", "*.osm")
-_WIDEST_M = 20_000.0
+WIDEST_M = 20_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +92,16 @@ def _drawn(extract: Path, lat_lon: FloatArray) -> GeoreferencedMap:
     origin, xy = _local(lat_lon)
     low = np.floor(xy.min(axis=0) - OSM_MARGIN_M)
     size = xy.max(axis=0) + OSM_MARGIN_M - low
-    if not size.max() < _WIDEST_M:
-        raise SkyfixError(f"map: expected a drive within {_WIDEST_M:g} m, got fixes {size.max():g} m apart")
+    if not size.max() < WIDEST_M:
+        raise SkyfixError(f"map: expected a drive within {WIDEST_M:g} m, got fixes {size.max():g} m apart")
     cols, rows = np.ceil(size / OSM_METRES_PER_PIXEL).astype(int)
     grid = MapGrid(int(rows), int(cols), OSM_METRES_PER_PIXEL, float(low[0]), float(low[1]))
-    raster = rasterise(read_osm(extract, origin), grid)
+    return drawn_map(extract, read_osm(extract, origin), grid)
+
+
+def drawn_map(extract: Path, features: MapFeatures, grid: MapGrid) -> GeoreferencedMap:
+    """The features of an extract on a grid in their local frame; SkyfixError if there are none on it."""
+    raster, (lat, lon) = rasterise(features, grid), features.origin_lat_lon
     if raster.classes is None or not raster.classes.any():
-        raise SkyfixError(f"{extract}: expected map features around {origin[0]:.5f}, {origin[1]:.5f}, got none")
-    return GeoreferencedMap(raster, origin)
+        raise SkyfixError(f"{extract}: expected map features around {lat:.5f}, {lon:.5f}, got none")
+    return GeoreferencedMap(raster, (lat, lon))

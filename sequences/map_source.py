@@ -92,8 +92,11 @@ def read_map(directory: Path) -> MapRaster:
     return MapRaster(grid, None, picture)
 
 
-def write_map(directory: Path, map_raster: MapRaster) -> None:
-    """Write a map as `map.json` and one PNG: a class raster where classes are known, the picture otherwise."""
+def write_map(directory: Path, map_raster: MapRaster, origin_lat_lon: tuple[float, float] | None = None) -> None:
+    """Write a map as `map.json` and one PNG: a class raster where classes are known, the picture otherwise.
+
+    `origin_lat_lon`, degrees, says where the map frame's origin is (see `sequences.osm.local_projection`).
+    """
     grid = map_raster.grid
     if map_raster.classes is not None:
         layer = {"name": "semantic", "file": "map.png", "classes": list(CLASSES)}
@@ -108,7 +111,7 @@ def write_map(directory: Path, map_raster: MapRaster) -> None:
         "x0": grid.x0,
         "y0": grid.y0,
         "layers": [layer],
-        "origin_lat_lon_alt": None,
+        "origin_lat_lon_alt": None if origin_lat_lon is None else [*origin_lat_lon, 0.0],
     }
     (directory / MAP_FILE).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
 
