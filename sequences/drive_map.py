@@ -14,7 +14,6 @@ and where none does, the satellite images of KITTI + aerial, one a record of the
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from learned.map_raster import MapRaster
 from sequences.aerial_mosaic import mosaic
-from sequences.map_source import MAP_FILE, read_json, read_map
+from sequences.map_source import MAP_FILE, read_map, read_origin
 from sequences.osm import MapFeatures, local_projection, rasterise, read_osm
 from sequences.satellite import read_satellite_image
 
@@ -81,11 +80,10 @@ def _local(lat_lon: FloatArray) -> tuple[tuple[float, float], FloatArray]:
 
 
 def _folder_map(folder: Path) -> GeoreferencedMap:
-    origin = read_json(folder / MAP_FILE).get("origin_lat_lon_alt")
-    values = origin if isinstance(origin, list) else []
-    if len(values) not in (2, 3) or not all(isinstance(v, (int, float)) and math.isfinite(v) for v in values):
-        raise SkyfixError(f"{folder / MAP_FILE}: origin_lat_lon_alt: expected two or three numbers, got {origin!r}")
-    return GeoreferencedMap(read_map(folder), (float(values[0]), float(values[1])))
+    origin = read_origin(folder)
+    if origin is None:
+        raise SkyfixError(f"{folder / MAP_FILE}: origin_lat_lon_alt: expected two or three numbers, got None")
+    return GeoreferencedMap(read_map(folder), origin)
 
 
 def _drawn(extract: Path, lat_lon: FloatArray) -> GeoreferencedMap:

@@ -24,10 +24,10 @@ from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
 from learned.map_raster import MapRaster
 from sequences.lidar import LidarModel, simulate_scan
-from sequences.map_source import read_json, read_map, read_number, write_map
+from sequences.map_source import read_json, read_map, read_number, read_origin, write_map
 from sequences.odometry_files import OdometryFiles
 from sequences.point_file import read_points
-from sequences.sequence import ScanError, Sequence
+from sequences.sequence import ScanError, Sequence, origin_of
 from sequences.trajectory_io import format_seconds, read_times, read_tum, write_tum
 from sequences.world_model import World
 from sequences.world_raster import world_from_raster
@@ -57,6 +57,7 @@ class FolderSequence:
             raise SkyfixError(f"{self._path}: expected a sequence folder (map.json, odometry/, scans/), got none")
         self.name = self._path.resolve().name
         self.map: MapRaster = read_map(self._path)
+        self.origin_lat_lon = read_origin(self._path)
         truth_file = self._path / "ground_truth.tum"
         self.ground_truth: Trajectory | None = read_tum(truth_file) if truth_file.exists() else None
         self._odometry = OdometryFiles(self._path, self.name)
@@ -137,7 +138,7 @@ def write_folder(path: Path, sequence: Sequence) -> None:
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise SkyfixError(f"{path}: expected a new or empty folder")
     (path / "odometry").mkdir(parents=True)
-    write_map(path, sequence.map)
+    write_map(path, sequence.map, origin_of(sequence))
     if sequence.ground_truth is not None:
         write_tum(path / "ground_truth.tum", sequence.ground_truth)
     for name in sequence.odometry_names:

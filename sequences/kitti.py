@@ -63,6 +63,7 @@ class KittiDrive:
         images = [root / "satmap" / drive.parent.name / drive.name / f"{name}.png" for name in oxts.names]
         found = find_map((drive, drive.parent, drive.parent.parent), oxts.values[:, :2], images)
         self.map: MapRaster = found.raster
+        self.origin_lat_lon = found.origin_lat_lon
         poses = planar(oxts.map_from_imu(found.origin_lat_lon) @ imu_from_velo)
         truth = Trajectory(oxts.stamps_ns, poses, None, "map")
         self.ground_truth: Trajectory | None = truth

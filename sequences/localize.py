@@ -23,7 +23,7 @@ from sequences.metrics import position_errors
 from sequences.offline import calibrate_drive, smooth_drive
 from sequences.run_metrics import run_metrics
 from sequences.run_result import FrameRow, RunResult, Snapshot
-from sequences.sequence import Sequence
+from sequences.sequence import Sequence, origin_of
 from sequences.start import start_prior
 from sequences.track_settings import TrackSettings
 
@@ -108,6 +108,7 @@ def track(
         odometry_calibration=calibration,
         filter_calibration=filter_calibration,
         log=[*_described(drive), *online.log],
+        origin_lat_lon=origin_of(sequence),
     )
     return replace(result, metrics=run_metrics(result, smoothing_s))
 

@@ -92,6 +92,23 @@ def read_map(directory: Path) -> MapRaster:
     return MapRaster(grid, None, picture)
 
 
+def read_origin(directory: Path) -> tuple[float, float] | None:
+    """Latitude and longitude, degrees, of the origin of `directory/map.json`'s frame; None where it is not given.
+
+    Raises
+    ------
+    SkyfixError
+        If the file is missing or unreadable, or `origin_lat_lon_alt` is anything else than two or three numbers.
+    """
+    origin = read_json(directory / MAP_FILE).get("origin_lat_lon_alt")
+    if origin is None:
+        return None
+    values = origin if isinstance(origin, list) else []
+    if len(values) not in (2, 3) or not all(isinstance(v, (int, float)) and math.isfinite(v) for v in values):
+        raise SkyfixError(f"{directory / MAP_FILE}: origin_lat_lon_alt: expected two or three numbers, got {origin!r}")
+    return float(values[0]), float(values[1])
+
+
 def write_map(directory: Path, map_raster: MapRaster, origin_lat_lon: tuple[float, float] | None = None) -> None:
     """Write a map as `map.json` and one PNG: a class raster where classes are known, the picture otherwise.
 

@@ -24,6 +24,7 @@ import yaml
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
 from sequences.filter_pass import STAGES
+from sequences.geojson import write_geojson
 from sequences.metrics import position_errors, vehicle_frame_errors
 from sequences.report import write_report
 from sequences.run_files import CONFIG_FILE, METRICS_FILE, check_target
@@ -89,6 +90,8 @@ def _write_files(result: RunResult, out_dir: Path) -> None:
     (out_dir / METRICS_FILE).write_text(metrics + "\n", encoding="utf-8")
     for name in ("filter", "smoother", "odometry", "single_shot"):
         write_tum(out_dir / f"{name}.tum", getattr(result, name))
+    if result.origin_lat_lon is not None:
+        write_geojson(result, result.origin_lat_lon, out_dir / "trajectories.geojson")
     _write_frames(result, out_dir / "frames.csv")
     (out_dir / "log.txt").write_text("".join(f"{line}\n" for line in result.log), encoding="utf-8")
     write_report(result, out_dir)

@@ -131,6 +131,8 @@ class RunResult:
         The same for a filter, which cannot follow a scale that wanders and takes it as noise.
     log
         Lines of `log.txt`.
+    origin_lat_lon
+        Latitude and longitude of the map frame's origin, degrees, where they are known.
     """
 
     sequence_name: str
@@ -153,3 +155,4 @@ class RunResult:
     odometry_calibration: OdometryCalibration
     filter_calibration: OdometryCalibration
     log: list[str]
+    origin_lat_lon: tuple[float, float] | None = None

@@ -80,6 +80,15 @@ def checked_points(points: NDArray[np.float32], label: str) -> NDArray[np.float3
     return points
 
 
+def origin_of(sequence: Sequence) -> tuple[float, float] | None:
+    """Latitude and longitude, degrees, of the map frame's origin (`sequences.osm.local_projection`).
+
+    Readers that know it have an attribute `origin_lat_lon` more than the protocol asks for; None for the others.
+    """
+    origin: tuple[float, float] | None = getattr(sequence, "origin_lat_lon", None)
+    return origin
+
+
 def odometry_is_emulated(name: str) -> bool:
     """Whether an odometry was made from the ground truth with drift added; the name says so by the format's
     convention."""

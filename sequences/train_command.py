@@ -120,6 +120,10 @@ def train_from_config(
         source = SimulatedSamples(extracts, config.simulation, cache_dir / "training")
         held_out = [(find_extract(config.validation_extract, data_dir), 1.0)]
         validation = SimulatedSamples(held_out, validation_settings(config), cache_dir / "validation")
+        # Made before training, so that a cache of other samples is refused at once and not in the end.
+        far = SimulatedSamples(
+            held_out, calibration_settings(config), cache_dir / f"calibration_{config.matching_reach_m:g}m"
+        )
         config = _settled(config, out_dir, options.minutes, source, validation, processes)
         if processes.is_first:
             write_config(config, out_dir / RESOLVED_FILE)
@@ -136,7 +140,6 @@ def train_from_config(
         )
         path = out_dir / f"{config.training.network.name}.safetensors"
         if processes.is_first:
-            far = SimulatedSamples(held_out, calibration_settings(config), cache_dir / "calibration")
             command = " ".join(["skyfix train", config_path.name, *(f"--set {o}" for o in options.overrides)])
             if options.initial is not None:
                 command += f" --initial {options.initial.name}"

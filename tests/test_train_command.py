@@ -65,6 +65,20 @@ def test_a_checkpoint_comes_out_calibrated_and_with_its_provenance(tiny: Path, t
         train_from_config(tiny, tmp_path, tmp_path / "other", options=other)
 
 
+def test_networks_of_another_reach_share_a_cache(tiny: Path, tmp_path: Path) -> None:
+    """What they are calibrated on differs with the reach, what they are trained on does not."""
+    cache = tmp_path / "cache"
+    train_from_config(tiny, tmp_path, tmp_path / "one", options=TrainOptions(cache_dir=cache))
+    farther = TrainOptions(("matching_half_extent_m=52",), cache_dir=cache)
+    assert train_from_config(tiny, tmp_path, tmp_path / "two", options=farther).exists()
+    (cache / "calibration_56m").mkdir()
+    (cache / "calibration_56m" / "made_with.json").write_text((cache / "calibration_52m/made_with.json").read_text())
+    spoilt = TrainOptions(("matching_half_extent_m=56",), cache_dir=cache)
+    with pytest.raises(SkyfixError, match="calibration_56m: its samples were made with"):
+        train_from_config(tiny, tmp_path, tmp_path / "three", options=spoilt)
+    assert not (tmp_path / "three" / "state.pt").exists()  # before a step was taken, not after the last
+
+
 def test_training_goes_on_from_a_checkpoint(tiny: Path, tmp_path: Path) -> None:
     """With steps of no length the weights are those that it started from; another network's are refused."""
     first = train_from_config(tiny, tmp_path, tmp_path / "first")
