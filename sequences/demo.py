@@ -90,6 +90,7 @@ class DemoSequence:
         self._seed = seed
         self._lidar = LidarModel()
         self._features = helsinki_features()
+        self.origin_lat_lon = self._features.origin_lat_lon
         path = smooth_path(route_through(road_graph(self._features), _WAYPOINTS), _LENGTH_M)
         self.ground_truth: Trajectory = drive(path)
         self._path_xy = path[:, :2]
