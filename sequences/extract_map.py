@@ -17,6 +17,7 @@ from sequences.map_source import MAP_FILE, write_map
 from sequences.osm import local_projection, read_osm
 
 PREVIEW_FILE = "map_preview.png"
+_MOST_PIXELS = 4 * 10**8
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +80,11 @@ def map_of_extract(extract: Path, request: MapRequest) -> GeoreferencedMap:
     elif (size := max(x_max - x_min, y_max - y_min)) > WIDEST_M:
         raise SkyfixError(f"{extract.name}: expected one within {WIDEST_M:g} m, got {size:.0f}; choose a --half-extent")
     rows, cols = (math.ceil(round(extent / step, 6)) for extent in (y_max - y_min, x_max - x_min))
+    if rows * cols > _MOST_PIXELS:
+        raise SkyfixError(
+            f"map: expected at most {_MOST_PIXELS:.0e} pixels, got {rows} x {cols}; "
+            "choose a smaller --half-extent or larger --metres-per-pixel"
+        )
     return drawn_map(extract, features, MapGrid(max(rows, 1), max(cols, 1), step, x_min, y_min))
 
 

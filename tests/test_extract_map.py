@@ -94,6 +94,7 @@ def test_the_command_says_what_it_drew(
         (lambda: MapRequest((float("nan"), 8.0)), "origin: expected a latitude"),
         (lambda: MapRequest(half_extent_m=-3.0), "expected a half extent above 0"),
         (lambda: MapRequest(metres_per_pixel=0.0), "expected a metres per pixel above 0"),
+        (lambda: MapRequest(ORIGIN, 15_000.0, 0.5), "expected at most 4e.08 pixels, got 60000 x 60000"),
         (lambda: MapRequest((10.0, 8.0)), "origin: expected one within 20000 m of test.osm.pbf, got 10 8"),
         (lambda: MapRequest((ORIGIN[0] + 0.1, ORIGIN[1]), 50.0), "expected map features around"),
     ],
