@@ -390,7 +390,7 @@ def test_odometry_that_is_not_emulated_is_preferred(made_drive: MadeDrive) -> No
 
 
 @pytest.mark.parametrize(
-    "command", [command.callback.__name__ for command in app.registered_commands if command.callback]
+    "command", [command.name or command.callback.__name__ for command in app.registered_commands if command.callback]
 )
 def test_help_explains_every_option_and_gives_an_example(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
