@@ -28,7 +28,7 @@ def draw_map(
         float | None,
         typer.Option(help="Draw a square of this half side about the origin, metres. Default: all of it.", metavar="M"),
     ] = None,
-    metres_per_pixel: Annotated[float, typer.Option(help="Resolution.", metavar="M")] = 0.5,
+    metres_per_pixel: Annotated[float, typer.Option(help="Side of a pixel; matching works at 0.5.", metavar="M")] = 0.5,
     place: Annotated[
         _LatLon | None,
         typer.Option(help="Also say where this is on the map, for track --start.", metavar="LAT LON"),
