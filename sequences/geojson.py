@@ -10,6 +10,7 @@ from pyproj.enums import TransformDirection
 from fusion.trajectory import Trajectory
 from sequences.osm import local_projection
 from sequences.run_result import RunResult
+from sequences.sequence import odometry_is_emulated
 
 _DIGITS = 8  # of a degree: a millimetre
 
@@ -28,7 +29,13 @@ def write_geojson(result: RunResult, origin_lat_lon: tuple[float, float], path: 
     """
     lines = {"truth": result.truth, "odometry": result.odometry, "filter": result.filter, "smoother": result.smoother}
     features = [_line(name, line, origin_lat_lon) for name, line in lines.items() if line is not None]
-    content = {"type": "FeatureCollection", "features": features}
+    content = {
+        "type": "FeatureCollection",
+        "odometry": result.odometry_source,
+        "odometry_emulated": odometry_is_emulated(result.odometry_source),
+        "scans_simulated": result.scans_simulated,
+        "features": features,
+    }
     path.write_text(json.dumps(content) + "\n", encoding="utf-8")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
@@ -99,9 +100,11 @@ def test_the_command_says_what_it_drew(
         (lambda: MapRequest((ORIGIN[0] + 0.1, ORIGIN[1]), 50.0), "expected map features around"),
     ],
 )
-def test_bad_requests_are_one_line_and_write_nothing(tmp_path: Path, request_of: object, expected: str) -> None:
+def test_bad_requests_are_one_line_and_write_nothing(
+    tmp_path: Path, request_of: Callable[[], MapRequest], expected: str
+) -> None:
     with pytest.raises(SkyfixError, match=expected) as caught:
-        write_extract_map(tmp_path / "mine", map_of_extract(EXTRACT, request_of()))  # type: ignore[operator]
+        write_extract_map(tmp_path / "mine", map_of_extract(EXTRACT, request_of()))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "mine").exists()
 

@@ -36,6 +36,8 @@ def test_lines_are_where_the_geodesic_has_them(made_drive: MadeDrive, tmp_path: 
     write_geojson(result, ORIGIN, tmp_path / "lines.geojson")
     content = json.loads((tmp_path / "lines.geojson").read_text())
     lines = {each["properties"]["name"]: np.array(each["geometry"]["coordinates"]) for each in content["features"]}
+    told = {key: content[key] for key in ("odometry", "odometry_emulated", "scans_simulated")}
+    assert told == {"odometry": "wheels", "odometry_emulated": False, "scans_simulated": sequence.scans_simulated}
     assert list(lines) == ["truth", "odometry", "filter", "smoother"]
     for name, line in lines.items():
         poses = getattr(result, name).poses
