@@ -80,6 +80,8 @@ def test_what_is_wrong_is_said_with_the_override(override: str, expected: str) -
 def test_settings_that_a_drive_cannot_have_are_refused_before_it_starts() -> None:
     with pytest.raises(SkyfixError, match="odometry_kernel: expected huber or none"):
         TrackSettings("wheels", smoother=changed(DEFAULTS, ["smoother.odometry_kernel=dcs"])["smoother"])
+    with pytest.raises(SkyfixError, match="smoother drift: expected none, it is found from the drive"):
+        TrackSettings("wheels", smoother=changed(DEFAULTS, ["smoother.drift={}"])["smoother"])
 
 
 KEYS = st.text(st.characters(codec="ascii", categories=["Ll"]), min_size=1, max_size=4)

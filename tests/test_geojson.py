@@ -11,11 +11,13 @@ import pyproj
 import pytest
 from made_drive import EmulatedMatcher, MadeDrive
 
+import sequences.run_directory as run_directory
 from fusion.errors import SkyfixError
 from sequences.folder import FolderSequence, write_folder
 from sequences.geojson import write_geojson
 from sequences.localize import track
 from sequences.map_source import MAP_FILE
+from sequences.run_directory import write_run
 from sequences.sequence import origin_of
 from sequences.track_settings import TrackSettings
 
@@ -28,13 +30,16 @@ def georeferenced(made: MadeDrive, origin: object) -> Path:
     return made.path
 
 
-def test_lines_are_where_the_geodesic_has_them(made_drive: MadeDrive, tmp_path: Path) -> None:
+def test_lines_are_where_the_geodesic_has_them(
+    made_drive: MadeDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sequence = FolderSequence(georeferenced(made_drive, [*ORIGIN, 112.0]))
     settings = TrackSettings("wheels", seed=3, particles=500)
     result = track(sequence, EmulatedMatcher(made_drive.truth.poses), settings)
     assert result.origin_lat_lon == origin_of(sequence) == ORIGIN
-    write_geojson(result, ORIGIN, tmp_path / "lines.geojson")
-    content = json.loads((tmp_path / "lines.geojson").read_text())
+    monkeypatch.setattr(run_directory, "write_report", lambda result, out_dir: None)
+    write_run(result, tmp_path / "run")
+    content = json.loads((tmp_path / "run" / "trajectories.geojson").read_text())
     lines = {each["properties"]["name"]: np.array(each["geometry"]["coordinates"]) for each in content["features"]}
     told = {key: content[key] for key in ("odometry", "odometry_emulated", "scans_simulated")}
     assert told == {"odometry": "wheels", "odometry_emulated": False, "scans_simulated": sequence.scans_simulated}
