@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import ConfigDict, ValidationError, create_model
 
 from fusion.errors import SkyfixError
-from learned import aglnet, hybrid, orienternet, rotmatch, translocnet_matcher
+from learned import aglnet, hybrid, orienternet, rotmatch, translocnet_matcher, translocnet_voting
 from learned.network import Architecture
 
 ARCHITECTURES: dict[str, Architecture] = {
@@ -24,6 +24,7 @@ ARCHITECTURES: dict[str, Architecture] = {
         hybrid.ARCHITECTURE,
         translocnet_matcher.ARCHITECTURE,
         translocnet_matcher.COMPACT_ARCHITECTURE,
+        translocnet_voting.ARCHITECTURE,
     )
 }
 """By name."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
 from fusion.errors import SkyfixError
 from learned.calibration import Calibration
@@ -66,6 +68,40 @@ def load_network(path: Path, architecture: Architecture) -> tuple[Any, Calibrati
         what = str(error).splitlines()[-1].strip()
         raise SkyfixError(f"checkpoint {path.name}: its weights do not fit its stated sizes: {what}") from error
     return net, calibration
+
+
+@dataclass(frozen=True, slots=True)
+class InitialWeights:
+    """Weights that a training starts from.
+
+    Attributes
+    ----------
+    weights
+        By the parameters' names.
+    is_part
+        They are those of some modules, and the others start afresh; otherwise they have to be all.
+    """
+
+    weights: Mapping[str, Tensor]
+    is_part: bool = False
+
+
+def load_initial(path: Path, architecture: Architecture) -> InitialWeights:
+    """What a checkpoint holds to start a training of an architecture from.
+
+    Raises
+    ------
+    SkyfixError
+        If it is neither of that architecture nor of one that pre-trains it, or as `load_network`.
+    """
+    from learned.architectures import architecture_named
+
+    before = str(_facts(path).get("architecture")).rpartition("-")[0]
+    if before not in architecture.pretrained_by:
+        return InitialWeights(load_network(path, architecture)[0].state_dict())
+    modules = architecture.pretrained_by[before]
+    weights = load_network(path, architecture_named(before))[0].state_dict()
+    return InitialWeights({name: each for name, each in weights.items() if name.split(".")[0] in modules}, is_part=True)
 
 
 def load_checkpoint(path: Path) -> NetworkMatcher:

@@ -86,3 +86,21 @@ class FeatureNet(Pyramid):
     def forward(self, image: Tensor) -> Tensor:
         """Features at half the resolution of the image."""
         return self.head(self.levels(image)[0])
+
+
+class LevelHead(nn.Module):
+    """Levels of features, the finest first -> channels at the finest: its projection, and those of the others if asked."""
+
+    def __init__(self, widths: tuple[int, ...], outputs: int, multi_scale: bool) -> None:
+        super().__init__()
+        self.finest = nn.Conv2d(widths[0], outputs, 1)
+        coarser = widths[1:] if multi_scale else ()
+        self.coarser = nn.ModuleList([nn.Conv2d(width, outputs, 1, bias=False) for width in coarser])
+
+    def forward(self, levels: list[Tensor]) -> Tensor:
+        """(B, outputs, H, W) of the finest level; a sum of projections is the projection of the concatenated levels."""
+        x = self.finest(levels[0])
+        size = x.shape[-2:]
+        for project, level in zip(self.coarser, levels[1:], strict=False):
+            x = x + nn.functional.interpolate(project(level), size=size, mode="bilinear", align_corners=False)
+        return x

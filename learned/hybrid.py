@@ -24,7 +24,7 @@ from fusion.errors import SkyfixError
 from learned.bev import BANDS_M, BevSettings
 from learned.calibration import Calibration
 from learned.contrastive import Projection, info_nce
-from learned.feature_net import STEM_STRIDE, Pyramid
+from learned.feature_net import STEM_STRIDE, LevelHead, Pyramid
 from learned.losses import HeadingQuadrature
 from learned.network import Architecture, Batch
 from learned.set_attention import BidirectionalSetAttention, RingSpectrum
@@ -95,24 +95,6 @@ class HybridSettings:
             raise SkyfixError("hybrid: expected a likelihood_weight or a regression_weight above zero, got neither")
 
 
-class _Head(nn.Module):
-    """Decoded levels -> channels at the finest: a projection of the finest level, of the others too if asked."""
-
-    def __init__(self, widths: tuple[int, ...], outputs: int, multi_scale: bool) -> None:
-        super().__init__()
-        self.finest = nn.Conv2d(widths[0], outputs, 1)
-        coarser = widths[1:] if multi_scale else ()
-        self.coarser = nn.ModuleList([nn.Conv2d(width, outputs, 1, bias=False) for width in coarser])
-
-    def forward(self, levels: list[Tensor]) -> Tensor:
-        """(B, outputs, H / 2, W / 2); a sum of projections is the projection of the concatenated levels."""
-        x = self.finest(levels[0])
-        size = x.shape[-2:]
-        for project, level in zip(self.coarser, levels[1:], strict=False):
-            x = x + functional.interpolate(project(level), size=size, mode="bilinear", align_corners=False)
-        return x
-
-
 class HybridNet(VotingNet):
     """Two U-Nets that may attend to each other, one vote; implements `learned.network.LocalizationNet`."""
 
@@ -121,8 +103,8 @@ class HybridNet(VotingNet):
         self.settings = settings
         widths, coarsest = settings.widths, settings.widths[-1]
         self.scan_trunk, self.map_trunk = Pyramid(len(BANDS_M), widths), Pyramid(3, widths)
-        self.scan_head = _Head(widths, settings.channels, settings.multi_scale)
-        self.map_head = _Head(widths, settings.channels, settings.multi_scale)
+        self.scan_head = LevelHead(widths, settings.channels, settings.multi_scale)
+        self.map_head = LevelHead(widths, settings.channels, settings.multi_scale)
         self.attention = (
             BidirectionalSetAttention(coarsest, coarsest, settings.attention_heads)
             if settings.cross_attention

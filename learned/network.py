@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
@@ -186,6 +186,8 @@ class Architecture:
     needs_heading
         Whether the scan is turned by the heading known beforehand, so that it has to be known as well as in training;
         others vote over all headings.
+    pretrained_by
+        Architectures whose checkpoints can start a training of this one, and the modules that are then taken over.
     """
 
     name: str
@@ -196,6 +198,7 @@ class Architecture:
     version: int = 1
     factored: bool = False
     needs_heading: bool = False
+    pretrained_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def tag(self) -> str:

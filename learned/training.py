@@ -6,7 +6,6 @@ going on would have given.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Protocol
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from fusion.errors import SkyfixError
 from learned.batches import SampleSource, training_batches, validation_batch
+from learned.checkpoint import InitialWeights
 from learned.network import LocalizationNet
 from learned.processes import ALONE, Processes
 from learned.training_log import TrainingLog
@@ -63,7 +63,7 @@ def train(
     processes: Processes = ALONE,
     tensorboard: bool = False,
     view: ValidationView | None = None,
-    initial: Mapping[str, Tensor] | None = None,
+    initial: InitialWeights | None = None,
 ) -> LocalizationNet:
     """Train a network, resuming from OUT_DIR/state.pt where there is one.
 

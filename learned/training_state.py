@@ -8,7 +8,6 @@ import copy
 import io
 import os
 import pickle
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor
 
 from fusion.errors import SkyfixError
+from learned.checkpoint import InitialWeights
 from learned.network import LocalizationNet
 from learned.training_settings import TrainingSettings
 
@@ -46,8 +46,8 @@ class TrainingState:
         """The network that is validated and kept: the moving average where there is one."""
         return self.net if self.average is None else self.average
 
-    def start_from(self, weights: Mapping[str, Tensor]) -> None:
-        """Take the weights of a network of the same architecture in place of fresh ones.
+    def start_from(self, initial: InitialWeights) -> None:
+        """Take weights in place of fresh ones.
 
         Raises
         ------
@@ -57,7 +57,8 @@ class TrainingState:
         try:
             for net in (self.net, self.average):
                 if net is not None:
-                    net.load_state_dict(weights)
+                    others = net.state_dict() if initial.is_part else {}
+                    net.load_state_dict({**others, **initial.weights})
         except RuntimeError as error:
             what = str(error).splitlines()[-1].strip()
             raise SkyfixError(f"training: the initial weights do not fit the network: {what}") from error

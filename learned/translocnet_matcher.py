@@ -169,6 +169,12 @@ def _prior_yaw(search: SearchRegion) -> Tensor:
 
 
 ARCHITECTURE = Architecture(
-    "translocnet", TransLocNetSettings, TransLocNet, TransLocNetMatcher, factored=True, needs_heading=True
+    "translocnet",
+    TransLocNetSettings,
+    TransLocNet,
+    TransLocNetMatcher,
+    factored=True,
+    needs_heading=True,
+    pretrained_by={"translocnet-voting": ("map_encoder", "scan_encoder")},
 )
 COMPACT_ARCHITECTURE = replace(ARCHITECTURE, name="translocnet-compact", settings_type=CompactSettings)

@@ -22,7 +22,7 @@ from fusion import se2
 from fusion.errors import SkyfixError
 from learned.bev import log_density
 from learned.calibration import RIGHT_WITHIN_M, Calibration, fit_calibration, match_samples, mean_nll, sample_map
-from learned.checkpoint import load_network, save_network
+from learned.checkpoint import load_initial, load_network, save_network
 from learned.network import Architecture, LocalizationNet, on_cpu
 from learned.processes import Processes, joined_processes
 from learned.reliability import highest_density_level, region_coverage, reliability
@@ -57,7 +57,7 @@ class TrainOptions:
     tensorboard
         Also write event files.
     initial
-        Checkpoint of the same architecture to start from; None: fresh weights.
+        Checkpoint of the same architecture, or of one that pre-trains it, to start from; None: fresh weights.
     averaged
         Checkpoints of it whose weights are averaged with the trained ones, one for each of the configuration's shares.
     """
@@ -111,7 +111,7 @@ def train_from_config(
         count = len(config.averaged_shares)
         raise SkyfixError(f"averaged_shares: expected a --average for each of {count}, got {len(options.averaged)}")
     averaged = [load_network(path, architecture)[0].state_dict() for path in options.averaged]
-    initial = None if options.initial is None else load_network(options.initial, architecture)[0].state_dict()
+    initial = None if options.initial is None else load_initial(options.initial, architecture)
     config = config.with_checkpoints(options.initial, options.averaged)
     make_folder(out_dir)
     cache_dir = options.cache_dir or out_dir / "cache"
