@@ -89,7 +89,7 @@ class FeatureNet(Pyramid):
 
 
 class LevelHead(nn.Module):
-    """Levels of features, the finest first -> channels at the finest: its projection, and those of the others if asked."""
+    """Levels of features, the finest first -> channels at the finest: it projected, the others too if asked."""
 
     def __init__(self, widths: tuple[int, ...], outputs: int, multi_scale: bool) -> None:
         super().__init__()

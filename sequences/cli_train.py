@@ -37,7 +37,7 @@ def train(
     initial: Annotated[
         Path | None,
         typer.Option(
-            help="Start from the weights of this checkpoint, of the same architecture (fine-tuning) or of one that pre-trains it.",
+            help="Start from the weights of this checkpoint: of the same architecture, or of one that pre-trains it.",
             metavar="CHECKPOINT",
         ),
     ] = None,
