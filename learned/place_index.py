@@ -1,11 +1,11 @@
 """An index of the places of one map: what each looks like, to be compared with a scan at all headings at once.
 
 The map is cut into tiles, and every few metres along its roads into places. The index holds an embedding of each place
-(`learned.place_embedding`) and the map's features, coarsely. A lookup takes three steps: all places are compared by
-their embeddings; the likest are weighed by the vote of the scan's features about each (`learned.place_vote`), less its
-mean over the headings, since what a place gets whatever the heading is its own, more in a dense town than in a thin
-one, and says nothing of the scan; and the best of these by the whole vote at finer headings. The embedding's score is
-added to both. A tile is worth what its best place is.
+(`learned.place_embedding`) and the map's features. A lookup takes four steps: all places are compared by their
+embeddings; the likest are weighed by the vote of the scan's features about each on coarse cells (`learned.place_vote`),
+less its mean over the headings, since what a place gets whatever the heading is its own, more in a dense town than in a
+thin one, and says nothing of the scan; the best of these by the whole vote at finer headings, the embedding's score
+added to both; and the best place of each leading tile by the vote on the features' own cells, about the heading found.
 
 The comparison of embeddings is a product over all places and orders, then a Fourier sum over headings: exact, linear in
 the length of the map's roads, and far below the cost of the vote, which is the same however large the map. So no
@@ -18,12 +18,14 @@ from __future__ import annotations
 import tokenize
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray, IntArray
@@ -31,7 +33,7 @@ from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
 from learned.place_embedding import similarities
-from learned.place_vote import vote_at
+from learned.place_vote import best_votes, vote_at
 
 HEADINGS = 72
 """5 degrees apart: order 16 turns once in 22.5 degrees, and 10 would step over its peaks."""
@@ -39,6 +41,13 @@ _NATS = np.float32(20.0)
 """What a cosine of 1 is worth over one of 0: chosen with simulated scans of Helsinki in view."""
 _CLOSELY, _FINER = 96, 3
 """So many places are voted on at so many headings a bin."""
+_SHARPLY = 80
+_SHARP_YAWS = np.radians(np.arange(-3.0, 4.0))
+"""So many tiles' best places are voted on at such headings about the one found, on the features' own cells."""
+VOTE_CELLS = 2
+"""Feature cells on a side of one of the coarse vote's."""
+_FEATURE_SCALE = 127.0
+"""Features are unit vectors and kept as bytes."""
 _UNREADABLE = (
     SkyfixError,
     OSError,
@@ -67,7 +76,7 @@ class Retrieved:
     centres
         (k, 2) of the tiles, metres in the map frame.
     poses
-        (k, 3) the best place and heading of each: metres, radians.
+        (k, 3) the best pose found in each: metres, radians.
     scores
         (k,) of the best places, nats.
     place_scores
@@ -93,9 +102,9 @@ class PlaceIndex:
     embeddings
         (N, M + 1, D) complex64.
     features
-        (C, H, W) float16 of the map, from the grid's upper left corner on.
+        (C, H, W) int8, 127 times those of the map, from the grid's upper left corner on.
     feature_m
-        Side of their cells, metres; it divides that of the grid's cells.
+        Side of their cells, metres; twice that divides the side of the grid's cells.
     tile_cells
         Cells on a side of a tile; tiles are counted from the map's upper left corner.
     temperature
@@ -104,6 +113,8 @@ class PlaceIndex:
         Of the weights of the network that made it.
     map_digest
         Of the map.
+    coarse
+        (C, H / 2, W / 2) float16: the features averaged over the coarse vote's cells; made, not given.
     """
 
     grid: MapGrid
@@ -115,6 +126,16 @@ class PlaceIndex:
     temperature: float
     fingerprint: str
     map_digest: str
+    coarse: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        pooled = functional.avg_pool2d(self.features.float() / _FEATURE_SCALE, VOTE_CELLS).half()
+        object.__setattr__(self, "coarse", pooled)
+
+    @staticmethod
+    def kept(features: Tensor) -> Tensor:
+        """A map's features (C, H, W), unit vectors, as an index keeps them."""
+        return (features * _FEATURE_SCALE).round().to(torch.int8)
 
     @property
     def tiles(self) -> int:
@@ -140,7 +161,7 @@ class PlaceIndex:
         Parameters
         ----------
         embedding, scan
-            (M + 1, D) of the scan; (C, n, n) its features on the vote's cells.
+            (M + 1, D) of the scan; (C, n, n) its features, n a multiple of 4.
         shortlist
             So many places whose embeddings are the likest are voted on; no other counts as better than the worst.
 
@@ -154,25 +175,42 @@ class PlaceIndex:
         cosines = self.similarities(embedding)
         alike = _NATS * cosines.max(axis=1, keepdims=True)
         likest = np.argsort(-alike[:, 0], kind="stable")[:shortlist]
-        votes = self._votes(scan, likest, 1)
+        # A coarse cell stands for all the scan's cells in it: their sum, not their mean.
+        summed = functional.avg_pool2d(scan, VOTE_CELLS) * VOTE_CELLS**2
+        votes = self._votes(summed, likest, 1)
         votes += alike[likest] - votes.mean(axis=1, keepdims=True)
         scores = _with_better(_NATS * cosines, likest, votes)
         closest = likest[np.argsort(-votes.max(axis=1), kind="stable")[:_CLOSELY]]
-        scores = _with_better(scores, closest, self._votes(scan, closest, _FINER) + alike[closest])
+        scores = _with_better(scores, closest, self._votes(summed, closest, _FINER) + alike[closest])
         best = scores.max(axis=1)
         tiles = self.cells // self.tile_cells
         order = np.argsort(-best, kind="stable")
         _, first = np.unique(tiles[order], axis=0, return_index=True)
-        chosen = order[np.sort(first)[:k]]
-        yaw = se2.wrap(scores[chosen].argmax(axis=1) * (se2.TWO_PI / HEADINGS))
-        xy = self.grid.xy_from_pixel(self.cells[chosen] + 0.5)
+        chosen = order[np.sort(first)]  # the best place of each tile, the likeliest first
+        sharp, others = chosen[:_SHARPLY], chosen[_SHARPLY:]
+        votes, poses = self._sharp(scan, sharp, scores[sharp].argmax(axis=1))
+        scores = _with_better(scores, sharp, scores[sharp] + (votes - best[sharp])[:, None])
+        again = np.argsort(-votes, kind="stable")
+        yaw = scores[others].argmax(axis=1) * (se2.TWO_PI / HEADINGS)
+        unchanged = np.column_stack([self.grid.xy_from_pixel(self.cells[others] + 0.5), yaw])
+        chosen, poses = np.concatenate([sharp[again], others])[:k], np.concatenate([poses[again], unchanged])[:k]
+        poses[:, 2] = se2.wrap(poses[:, 2])
         centres = self.grid.xy_from_pixel((tiles[chosen] + 0.5) * self.tile_cells)
-        return Retrieved(centres, np.column_stack([xy, yaw]), best[chosen].astype(np.float64), scores)
+        return Retrieved(centres, poses, scores[chosen].max(axis=1).astype(np.float64), scores)
+
+    def _sharp(self, scan: Tensor, places: IntArray, bins: IntArray) -> tuple[Float32Array, FloatArray]:
+        """Votes (P,), nats, and poses (P, 3) of the best fit in places (P,) about heading bins (P,)."""
+        per_cell = round(self.grid.metres_per_pixel / self.feature_m)
+        yaws = (bins * (se2.TWO_PI / HEADINGS))[:, None] + _SHARP_YAWS
+        found = best_votes(self.features, scan / _FEATURE_SCALE, self.cells[places] * per_cell, per_cell, yaws)
+        yaw = np.take_along_axis(yaws, found.headings[:, None], axis=1)
+        poses = np.column_stack([self.grid.xy_from_pixel(found.corners / per_cell), yaw])
+        return np.asarray(found.votes / self.temperature, np.float32), poses
 
     def _votes(self, scan: Tensor, places: IntArray, finer: int) -> Float32Array:
         """Best votes (P, HEADINGS) at places (P,), nats; of so many headings in each bin, an odd number."""
-        per_cell = round(self.grid.metres_per_pixel / self.feature_m)
-        votes = vote_at(self.features, scan, self.cells[places] * per_cell, per_cell, finer * HEADINGS)
+        per_cell = round(self.grid.metres_per_pixel / (VOTE_CELLS * self.feature_m))
+        votes = vote_at(self.coarse, scan, self.cells[places] * per_cell, per_cell, finer * HEADINGS)
         binned = np.roll(votes, finer // 2, axis=1).reshape(len(places), HEADINGS, finer)
         return np.asarray(binned.max(axis=2) / self.temperature, np.float32)
 
@@ -235,7 +273,7 @@ class PlaceIndex:
                     MapGrid(int(rows), int(cols), step, x0, y0),
                     np.asarray(data["cells"], np.int64),
                     torch.view_as_complex(torch.from_numpy(embeddings)),
-                    torch.from_numpy(np.asarray(data["features"], np.float16)),
+                    torch.from_numpy(_as_bytes(data["features"])),
                     float(data["feature_m"]),
                     int(data["tile_cells"]),
                     float(data["temperature"]),
@@ -255,15 +293,20 @@ class PlaceIndex:
             raise ValueError(f"cells {cells.shape} that are not all within {plan[0]} x {plan[1]}")
         if self.embeddings.ndim != 3 or len(self.embeddings) != len(cells) or not self.embeddings.numel():
             raise ValueError(f"embeddings {tuple(self.embeddings.shape)} of {len(cells)} places")
-        if self.features.ndim != 3 or not self.features.numel():
-            raise ValueError(f"features {tuple(self.features.shape)}")
-        if not (torch.view_as_real(self.embeddings).isfinite().all() and self.features.isfinite().all()):
-            raise ValueError("embeddings or features that are not finite")
-        per_cell = self.grid.metres_per_pixel / self.feature_m if self.feature_m > 0.0 else 0.0
+        if not torch.view_as_real(self.embeddings).isfinite().all():
+            raise ValueError("embeddings that are not finite")
+        per_cell = self.grid.metres_per_pixel / (VOTE_CELLS * self.feature_m) if self.feature_m > 0.0 else 0.0
         if not (1.0 - 1e-9 < per_cell < np.inf and abs(per_cell - round(per_cell)) < 1e-9):
             raise ValueError(f"features on {self.feature_m} m for cells of {self.grid.metres_per_pixel} m")
         if self.tile_cells < 1 or not 0.0 < self.temperature < np.inf:
             raise ValueError(f"tiles of {self.tile_cells} cells and a temperature of {self.temperature}")
+
+
+def _as_bytes(features: NDArray[np.generic]) -> NDArray[np.int8]:
+    """Features as they are kept; ValueError for any others."""
+    if features.dtype != np.int8 or features.ndim != 3 or not features.size:
+        raise ValueError(f"features {features.shape} {features.dtype}")
+    return np.asarray(features, np.int8)
 
 
 def _with_better(scores: Float32Array, chosen: IntArray, better: Float32Array) -> Float32Array:

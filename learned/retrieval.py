@@ -25,13 +25,11 @@ from learned.bev import bev_counts, log_density
 from learned.map_raster import CLASS_INDEX, MapRaster
 from learned.network import picture_tensor
 from learned.place_embedding import PlaceEmbedding
-from learned.place_index import PlaceIndex, Retrieved
+from learned.place_index import VOTE_CELLS, PlaceIndex, Retrieved
 from learned.rotmatch import RotMatch, RotMatchNet
 
 _INNER_CELLS, _MARGIN_CELLS = 256, 28
 """The map's features are made in windows, of which the middle is kept."""
-_VOTE_CELLS = 2
-"""Feature cells on a side of one of the vote's."""
 _DRIVABLE = ("road", "path", "parking")
 _BARRED = ("building", "water")
 _AT_ONCE = 512
@@ -107,7 +105,7 @@ class Retriever:
             If no place of it can be driven on, or its cells are no multiple of the vote's.
         """
         settings = settings or TileSettings()
-        feature_m = _VOTE_CELLS * self._cell_m
+        feature_m = VOTE_CELLS * self._cell_m
         per_cell = settings.step_m / feature_m
         if round(per_cell) < 1 or abs(per_cell - round(per_cell)) > 1e-9:
             raise SkyfixError(f"tiles: expected a step_m of a multiple of {feature_m:g} m, got {settings.step_m:g} m")
@@ -118,13 +116,12 @@ class Retriever:
         with torch.inference_mode():
             features, feature_grid = map_features(self._net, map_raster)
             embeddings = self._embedded(features, feature_grid, grid.xy_from_pixel(cells + 0.5))
-            coarse = functional.avg_pool2d(features, _VOTE_CELLS).half()
         return PlaceIndex(
             grid,
             cells,
             embeddings.clone(),
-            coarse.clone(),
-            feature_m,
+            PlaceIndex.kept(features),
+            self._cell_m,
             round(settings.tile_m / settings.step_m),
             self._temperature,
             self._embedding.network,
@@ -151,9 +148,7 @@ class Retriever:
         with torch.inference_mode():
             features = self._net.scan_features(torch.from_numpy(log_density(counts))[None].float())
             embedding = self._embedding.of_scans(self._harmonics_of(features))[0]
-            # A coarse cell stands for all the scan's cells in it: their sum, not their mean.
-            scan = functional.avg_pool2d(features, _VOTE_CELLS)[0] * _VOTE_CELLS**2
-            return index.query(embedding, scan, k, shortlist)
+            return index.query(embedding, features[0], k, shortlist)
 
     def _harmonics_of(self, features: Tensor) -> Tensor:
         return self._harmonics.of(functional.avg_pool2d(features, self._pool), self._basis)

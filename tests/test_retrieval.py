@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
@@ -21,7 +22,7 @@ from learned.matcher import SearchRegion
 from learned.network import picture_tensor
 from learned.place_embedding import PlaceEmbedding, order_factors, similarities
 from learned.place_index import HEADINGS, PlaceIndex, Retrieved
-from learned.place_vote import vote_at
+from learned.place_vote import best_votes, vote_at
 from learned.retrieval import Retriever, TileSettings, fingerprint_of, map_features
 from learned.ring_harmonics import RingHarmonics, at_headings
 from learned.rotmatch import RotMatch, RotMatchNet, RotMatchSettings
@@ -93,12 +94,17 @@ def looked_up(index: PlaceIndex, place: int, turn: int, k: int, shortlist: int =
     """A scan that saw just what the map shows at a place, the vehicle turned by `turn` quarters, looked up."""
     orders = torch.arange(RINGS.orders + 1)
     embedding = index.embeddings[place] * torch.exp(0.5j * math.pi * turn * orders)[:, None]
-    per_cell = round(index.grid.metres_per_pixel / index.feature_m)
-    row, col = index.cells[place] * per_cell + per_cell // 2
-    padded = torch.nn.functional.pad(index.features.float(), (10, 10, 10, 10))
     # Turning the vehicle to the left turns what it sees to the right.
-    scan = torch.rot90(padded[:, row : row + 20, col : col + 20], -turn, dims=(1, 2)).contiguous()
+    scan = torch.rot90(seen_at(index, place), -turn, dims=(1, 2)).contiguous()
     return index.query(embedding, scan, k, shortlist)
+
+
+def seen_at(index: PlaceIndex, place: int, right: int = 0, down: int = 0) -> Tensor:
+    """The map's features within 20 m of a place's middle, or of so many cells beside it."""
+    per_cell = round(index.grid.metres_per_pixel / index.feature_m)
+    row, col = index.cells[place] * per_cell + per_cell // 2 + [down, right]
+    padded = torch.nn.functional.pad(index.features.float() / 127.0, (20, 20, 20, 20))
+    return padded[:, row : row + 40, col : col + 40].contiguous()
 
 
 def test_a_place_is_found_by_what_it_looks_like_whatever_the_heading(index: PlaceIndex) -> None:
@@ -128,25 +134,49 @@ def test_the_search_is_exact(index: PlaceIndex) -> None:
     assert few.scores[0] == pytest.approx(all_of_them.scores[0], rel=1e-5)
 
 
-def test_places_are_weighed_in_two_rounds(index: PlaceIndex, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By 20 times the cosine and the vote: less its mean over headings, and as it is for the closest few."""
+def test_a_pose_is_found_to_the_features_cell(index: PlaceIndex) -> None:
+    """The vehicle stands beside the middle of a place: the pose is its own, not the place's."""
+    rng = np.random.default_rng(3)
+    for place in rng.choice(len(index.cells), 6, replace=False):
+        right, down = rng.integers(-3, 4, 2)
+        found = index.query(index.embeddings[place], seen_at(index, int(place), int(right), int(down)), 1)
+        middle = index.grid.xy_from_pixel(index.cells[place] + 0.5)
+        np.testing.assert_allclose(found.poses[0], [*(middle + [right, -down]), 0.0], atol=1e-6)
+
+
+def test_places_are_weighed_in_three_rounds(index: PlaceIndex, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By 20 times the cosine and the coarse vote: less its mean over headings, and as it is for the closest few; the
+    best place of each tile by the vote on the features' own cells."""
     monkeypatch.setattr("learned.place_index._CLOSELY", 20)
     index = replace(index, temperature=2.0)
-    place, per_cell = 7, round(index.grid.metres_per_pixel / index.feature_m)
-    row, col = index.cells[place] * per_cell + per_cell // 2
-    padded = torch.nn.functional.pad(index.features.float(), (10, 10, 10, 10))
-    scan = padded[:, row : row + 20, col : col + 20].contiguous()
-    found = index.query(index.embeddings[place], scan, 1).place_scores
-    alike = 20.0 * index.similarities(index.embeddings[place]).max(axis=1, keepdims=True)
-    finer = vote_at(index.features, scan, index.cells * per_cell, per_cell, 3 * HEADINGS) / index.temperature
+    scan = seen_at(index, 7)
+    found = index.query(index.embeddings[7], scan, 1).place_scores
+    alike = 20.0 * index.similarities(index.embeddings[7]).max(axis=1, keepdims=True)
+    per_cell = round(index.grid.metres_per_pixel / index.feature_m)
+    summed = scan.unfold(1, 2, 2).unfold(2, 2, 2).sum(dim=(3, 4))
+    finer = vote_at(index.coarse, summed, index.cells * per_cell // 2, per_cell // 2, 3 * HEADINGS) / index.temperature
     votes = finer[:, ::3]
     weighed = votes - votes.mean(axis=1, keepdims=True) + alike
     closest, others = np.split(np.argsort(-weighed.max(axis=1), kind="stable"), [20])
     assert len(others) > 10
     closely = np.maximum(np.maximum(finer[:, ::3], finer[:, 1::3]), np.roll(finer[:, 2::3], 1, axis=1)) + alike
-    np.testing.assert_allclose(found[closest], closely[closest], rtol=1e-4, atol=1e-3)
-    np.testing.assert_allclose(found[others] - weighed[others], (found - weighed)[others[0], 0], rtol=1e-3, atol=1e-3)
-    assert found[others].max() == pytest.approx(found[closest].max(axis=1).min(), rel=1e-4)
+    two = weighed + (closely[closest].max(axis=1).min() - weighed[others].max())
+    two[closest] = closely[closest]
+    leads = np.zeros(len(two), np.bool_)
+    for tile in np.unique(index.cells // index.tile_cells, axis=0):
+        within = np.flatnonzero((index.cells // index.tile_cells == tile).all(axis=1))
+        leads[within[np.argmax(two[within].max(axis=1))]] = True
+    assert leads.sum() == index.tiles < 80
+    lifted = (found - two)[~leads]
+    np.testing.assert_allclose(lifted, lifted[0, 0], rtol=1e-3, atol=2e-3)
+    for place in np.flatnonzero(leads):
+        yaws = torch.tensor(np.radians(np.arange(-3.0, 4.0)) + two[place].argmax() * (2 * math.pi / HEADINGS))
+        corner = index.cells[place] * per_cell
+        map_features = torch.nn.functional.pad(index.features.float() / 127.0, (20, 28, 20, 28))
+        square = map_features[:, corner[0] : corner[0] + 47, corner[1] : corner[1] + 47]
+        sharp = float(vote(square, scan, yaws).max()) / index.temperature
+        assert found[place].max() == pytest.approx(sharp, rel=1e-3, abs=1e-3)
+    assert found[~leads].max() == pytest.approx(found[leads].max(axis=1).min(), rel=1e-4)
 
 
 def test_votes_at_places_are_those_of_the_whole_map() -> None:
@@ -159,6 +189,13 @@ def test_votes_at_places_are_those_of_the_whole_map() -> None:
     for (row, col), votes in zip(corners - 6, found, strict=True):
         best = everywhere[:, row : row + 4, col : col + 4].max(axis=(1, 2))
         np.testing.assert_allclose(votes, best, rtol=1e-4, atol=1e-3)
+    own = (yaws[[3, 9, 20]][:, None] + torch.tensor([-0.02, 0.0, 0.05])).numpy()
+    best = best_votes(features, scan, corners, 4, own)
+    for number, (row, col) in enumerate(corners - 6):
+        votes = vote(features, scan, torch.from_numpy(own[number])).numpy()[:, row : row + 4, col : col + 4]
+        heading, down, right = np.unravel_index(votes.argmax(), votes.shape)
+        assert best.votes[number] == pytest.approx(votes.max(), rel=1e-4)
+        assert (*(best.corners[number] - corners[number]), best.headings[number]) == (down, right, heading)
     with pytest.raises(SkyfixError, match=r"scan features: expected \(3, n, n\), n even, got \(2, 12, 12\)"):
         vote_at(features, scan[:2], corners, 4, 24)
 
@@ -232,13 +269,11 @@ def test_scans_are_looked_up_and_the_same_twice(matcher: RotMatch, index: PlaceI
     first, again = (retriever.query(index, made_points(), -1.7, 5) for _ in range(2))
     np.testing.assert_array_equal(first.poses, again.poses)
     np.testing.assert_array_equal(first.scores, again.scores)
-    # The vote counts all that the scan shows: a coarse cell of it is the sum of the fine ones.
     counts = torch.from_numpy(log_density(bev_counts(made_points(), -1.7, matcher.net.settings.bev)))[None].float()
     with torch.inference_mode():
         seen = matcher.net.scan_features(counts)[0]
-        summed = seen.unfold(1, 2, 2).unfold(2, 2, 2).sum(dim=(3, 4))
         scan = embedding_of(matcher).of_scans(RINGS.of(torch.nn.functional.avg_pool2d(seen[None], 2), RINGS.basis()))[0]
-    np.testing.assert_allclose(first.scores, index.query(scan, summed, 5).scores, rtol=1e-4)
+    np.testing.assert_allclose(first.scores, index.query(scan, seen, 5).scores, rtol=1e-4)
 
 
 def test_a_filter_starts_from_an_answer(index: PlaceIndex) -> None:
@@ -290,7 +325,7 @@ def test_the_shipped_embedding_finds_tiles_of_a_simulated_town() -> None:
 @pytest.mark.parametrize(("k", "shortlist"), [(0, 72), (3, 0), (2.5, 72), (3, math.nan), ("3", 72), (None, 72)])
 def test_nothing_asked_for(index: PlaceIndex, k: int, shortlist: int) -> None:
     with pytest.raises(SkyfixError, match=f"expected whole k and shortlist of 1 or more, got {k} and {shortlist}"):
-        index.query(index.embeddings[0], torch.zeros(4, 20, 20), k, shortlist)
+        index.query(index.embeddings[0], torch.zeros(4, 40, 40), k, shortlist)
 
 
 def test_bad_input_is_one_line(matcher: RotMatch, index: PlaceIndex, tmp_path: Path) -> None:
@@ -361,7 +396,7 @@ def test_other_files_are_no_index(tmp_path: Path) -> None:
         ("cells", np.array([[999, 0]]), "cells .* not all within"),
         ("cells", np.zeros((0, 2), np.int64), "cells .* not all within"),
         ("embeddings", np.zeros((2, 7, 5, 2), np.float16), "embeddings .* of .* places"),
-        ("features", np.full((4, 8, 8), np.nan, np.float16), "not finite"),
+        ("features", np.zeros((4, 8, 8), np.float16), "features .* float16"),
         ("feature_m", np.array(0.0), "features on 0.0 m for cells of 8.0 m"),
         ("feature_m", np.array(3.0), "features on 3.0 m for cells of 8.0 m"),
         ("tile_cells", np.array(0), "tiles of 0 cells"),
