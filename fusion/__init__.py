@@ -26,6 +26,7 @@ from fusion.grid_filter import GridFilter, GridFilterSettings
 from fusion.grid_smoother import GridSmootherResult, smooth_on_grid
 from fusion.grids.pose_lattice import PoseLattice
 from fusion.hypotheses import Hypothesis, HypothesisSettings, HypothesisSmoother, HypothesisState
+from fusion.incremental import IncrementalSettings, IncrementalSmoother
 from fusion.kalman_filter import KalmanFilter, KalmanFilterSettings
 from fusion.lazy_orientation import LazyOrientation
 from fusion.likelihood import LikelihoodVolume, OutlierMixture, PoseLikelihood
@@ -72,6 +73,8 @@ __all__ = [
     "HypothesisSettings",
     "HypothesisSmoother",
     "HypothesisState",
+    "IncrementalSettings",
+    "IncrementalSmoother",
     "KalmanFilter",
     "KalmanFilterSettings",
     "KldSampling",

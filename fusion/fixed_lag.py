@@ -31,14 +31,12 @@ from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
-from fusion.graph.basins import around
 from fusion.graph.lag_rounds import refreshed, seen_at
 from fusion.graph.lag_settings import FixedLagSettings
-from fusion.graph.lag_window import KeptMeasurement, LagWindow, first_window
+from fusion.graph.lag_window import LagWindow, first_window, kept_measurement
 from fusion.graph.measurements import Measurement
-from fusion.graph.patch import LikelihoodPatch, patch_of, without_outliers
+from fusion.graph.patch import LikelihoodPatch
 from fusion.graph.sites import Sites
-from fusion.likelihood import OutlierMixture
 from fusion.odometry import OdometryIncrement
 from fusion.prior import UniformPrior
 from fusion.tracking.tracker_input import check_likelihood, checked_increment, checked_stamp, one_line
@@ -237,7 +235,7 @@ class FixedLagSmoother:
         try:
             if not exists:
                 window = window.split(stamp_ns).solved(settings.huber_width)
-            kept = _kept(likelihood, window.poses[place], window.covariances[place])
+            kept = kept_measurement(likelihood, window.poses[place], window.covariances[place])
             window, log_evidence = self._weighed(window.with_measurement(place, kept), place)
             window = self._settled(window).shortened(settings.lag, settings.huber_width)
         except SkyfixError:
@@ -292,13 +290,3 @@ class FixedLagSmoother:
     def _count(self, name: str) -> None:
         counts = replace(self._state.counts, **{name: getattr(self._state.counts, name) + 1})
         self._state = replace(self._state, counts=counts)
-
-
-def _kept(likelihood: Measurement, pose: FloatArray, covariance: FloatArray) -> KeptMeasurement:
-    if isinstance(likelihood, GaussianLikelihood):
-        return likelihood.modes(1)
-    if isinstance(likelihood, (GaussianMixture, LikelihoodPatch)):
-        return likelihood
-    if isinstance(likelihood, OutlierMixture) and isinstance(without_outliers(likelihood)[0], GaussianLikelihood):
-        return likelihood
-    return patch_of(likelihood, around(pose, covariance))

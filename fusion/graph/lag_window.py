@@ -10,10 +10,13 @@ import numpy as np
 from fusion import se2
 from fusion.arrays import FloatArray, IntArray
 from fusion.errors import SkyfixError
+from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
+from fusion.graph.basins import around
 from fusion.graph.chain_solver import solve_chain, without_first
 from fusion.graph.covariances import positive_definite, turned
-from fusion.graph.patch import LikelihoodPatch
+from fusion.graph.measurements import Measurement
+from fusion.graph.patch import LikelihoodPatch, patch_of, without_outliers
 from fusion.graph.sites import Sites
 from fusion.likelihood import OutlierMixture
 from fusion.odometry import OdometryIncrement
@@ -98,26 +101,15 @@ class LagWindow:
         return self._with_place(len(self), increment.stamp_ns, pose, covariance, increment.delta[None], spread[None])
 
     def split(self, stamp_ns: int) -> "LagWindow":
-        """One more pose between two: the motion is divided at constant twist, its covariance by time.
-
-        The covariances of both parts are such that together they have exactly that of the whole.
-        """
+        """One more pose between two: the motion is divided, see `divided`."""
         place = int(np.searchsorted(self.stamps, stamp_ns))
         before, after = self.stamps[place - 1 : place + 1].tolist()
         share = (stamp_ns - before) / (after - before)
-        delta, spread = self.deltas[place - 1], self.spreads[place - 1]
-        first = se2.exp(share * se2.log(delta))
-        second = se2.between(first, delta)
-        by_first = np.eye(3)
-        by_first[:2, 2] = first[1] - delta[1], delta[0] - first[0]
-        back = np.linalg.inv(by_first)
-        parts = [share * back @ spread @ back.T, (1.0 - share) * turned(spread, -first[2])]
+        deltas, spreads = divided(self.deltas[place - 1], self.spreads[place - 1], share)
         moved = se2.between(self.poses[place - 1], self.poses[place])
         pose = se2.compose(self.poses[place - 1], se2.exp(share * se2.log(moved)))
         guess = self.covariances[place]  # until the chain is solved
-        return self._with_place(
-            place, stamp_ns, pose, guess, np.array([first, second]), positive_definite(np.array(parts))
-        )
+        return self._with_place(place, stamp_ns, pose, guess, deltas, spreads)
 
     def _with_place(
         self,
@@ -198,6 +190,31 @@ class LagWindow:
         if not (np.isfinite(poses).all() and np.isfinite(covariances).all()):
             raise SkyfixError("fixed lag: expected a finite solution, got NaN or an infinity")
         return replace(self, poses=poses, covariances=covariances)
+
+
+def divided(delta: FloatArray, spread: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
+    """A motion (3,) and its covariance (3, 3) in two parts, (2, 3), (2, 3, 3): at constant twist, covariance by time.
+
+    The covariances of both parts are such that together they have exactly that of the whole.
+    """
+    first = se2.exp(share * se2.log(delta))
+    second = se2.between(first, delta)
+    by_first = np.eye(3)
+    by_first[:2, 2] = first[1] - delta[1], delta[0] - first[0]
+    back = np.linalg.inv(by_first)
+    parts = [share * back @ spread @ back.T, (1.0 - share) * turned(spread, -first[2])]
+    return np.array([first, second]), positive_definite(np.array(parts))
+
+
+def kept_measurement(likelihood: Measurement, pose: FloatArray, covariance: FloatArray) -> KeptMeasurement:
+    """What a smoother keeps of a likelihood: of a volume the part that can matter to a pose (3,), (3, 3)."""
+    if isinstance(likelihood, GaussianLikelihood):
+        return likelihood.modes(1)
+    if isinstance(likelihood, (GaussianMixture, LikelihoodPatch)):
+        return likelihood
+    if isinstance(likelihood, OutlierMixture) and isinstance(without_outliers(likelihood)[0], GaussianLikelihood):
+        return likelihood
+    return patch_of(likelihood, around(pose, covariance))
 
 
 def first_window(stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> LagWindow:

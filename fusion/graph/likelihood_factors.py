@@ -18,7 +18,6 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from fusion import se2
 from fusion.arrays import FloatArray, checked
 from fusion.errors import SkyfixError
 from fusion.graph.covariances import positive_definite, turned
@@ -90,9 +89,7 @@ class LikelihoodFactors:
             centres, spread = self._sites.cavities(poses, spread)
         found, _ = self._seen.windowed(centres, spread)
         self._sites = Sites(centres, *found.factors()).about(poses)
-        back = se2.rotation(-poses[:, 2])
-        precision = back @ self._sites.precision @ back.swapaxes(1, 2)
-        information = np.einsum("mij,mj->mi", back, self._sites.information)
+        precision, information = self._sites.on_body_axes()
         return [
             _factor(values, key, matrix, vector)
             for key, matrix, vector in zip(self._keys, precision, information, strict=True)

@@ -7,8 +7,8 @@ Source: Yang, Antonante, Tzoumas, Carlone, "Graduated non-convexity for robust s
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from dataclasses import dataclass, replace
+from typing import Self, TypeAlias
 
 import gtsam
 import numpy as np
@@ -53,6 +53,10 @@ class LoopClosure:
     def nodes(self) -> tuple[int, ...]:
         """The nodes that it binds."""
         return self.first, self.second
+
+    def on(self, first: int, second: int) -> Self:
+        """The same on other nodes."""
+        return replace(self, first=first, second=second)
 
     def factor(self, widening: float, first: int, second: int) -> gtsam.NonlinearFactor:
         """GTSAM's factor between two keys, its loss so many times as wide."""
@@ -103,6 +107,10 @@ class AbsoluteFix:
     def nodes(self) -> tuple[int, ...]:
         """The node that it binds."""
         return (self.node,)
+
+    def on(self, node: int) -> Self:
+        """The same on another node."""
+        return replace(self, node=node)
 
     def factor(self, widening: float, key: int) -> gtsam.NonlinearFactor:
         """GTSAM's factor on a key, its loss so many times as wide."""

@@ -64,6 +64,11 @@ class Sites:
         _costs(poses, self.reference, self.precision, self.information, found)
         return found
 
+    def on_body_axes(self) -> tuple[FloatArray, FloatArray]:
+        """Precision (M, 3, 3) and information (M, 3) for deviations on the axes of the references' bodies, GTSAM's."""
+        back = se2.rotation(-self.reference[:, 2])
+        return back @ self.precision @ back.swapaxes(1, 2), np.einsum("mij,mj->mi", back, self.information)
+
     def cavities(self, poses: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Marginals (M, 3), (M, 3, 3) with the own factor of each divided out."""
         own = self.about(poses)
