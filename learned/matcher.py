@@ -15,7 +15,7 @@ from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
 from learned.map_raster import MapRaster
 
-_NAMES = ("rotmatch", "geometric")
+_NAMES = ("rotmatch", "pooled", "geometric")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,9 @@ def matching_window(
 
 
 def load_matcher(name_or_path: str, backend: str | None = None) -> MapMatcher:
-    """Load a matcher: 'rotmatch' (the shipped weights), 'geometric' (no learning), a checkpoint or an export folder.
+    """Load a matcher by name or from a file.
+
+    'rotmatch' is the shipped network, 'pooled' asks the shipped hybrid beside it, 'geometric' has learned nothing.
 
     A checkpoint's .json says which network it is of, see `learned.checkpoint.load_checkpoint`.
 
@@ -149,14 +151,17 @@ def load_matcher(name_or_path: str, backend: str | None = None) -> MapMatcher:
 def _torch_matcher(name_or_path: str) -> MapMatcher:
     from learned.checkpoint import load_checkpoint
     from learned.geometric import GeometricMatcher
+    from learned.pooled import PooledMatcher
     from learned.rotmatch import RotMatch
 
     if name_or_path == "geometric":
         return GeometricMatcher()
     if name_or_path == "rotmatch":
         return RotMatch.shipped()
+    if name_or_path == "pooled":
+        return PooledMatcher.shipped()
     path = Path(name_or_path)
     if path.suffix == ".safetensors":
         return load_checkpoint(path)
-    expected = "'rotmatch', 'geometric', a .safetensors file or a folder of `skyfix export`"
+    expected = "'rotmatch', 'pooled', 'geometric', a .safetensors file or a folder of `skyfix export`"
     raise SkyfixError(f"matcher: expected {expected}, got {name_or_path!r}")

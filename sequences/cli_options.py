@@ -14,8 +14,8 @@ from fusion.errors import SkyfixError
 MatcherOption = Annotated[
     str,
     typer.Option(
-        help="Matches scans with the map: rotmatch (learned, shipped), geometric (no learning), a .safetensors file "
-        "or a folder of `skyfix export`.",
+        help="Matches scans with the map: rotmatch (learned, shipped), pooled (another network beside it: twice the "
+        "time, fewer mistakes), geometric (no learning), a .safetensors file or a folder of `skyfix export`.",
         metavar="NAME|FILE",
     ),
 ]
