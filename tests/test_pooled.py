@@ -8,7 +8,7 @@ import pytest
 from fusion import GaussianMixture, LikelihoodVolume, MapGrid, SkyfixError, se2
 from learned.geometric import GeometricMatcher
 from learned.map_raster import CLASS_INDEX, MapRaster
-from learned.matcher import SearchRegion, largest_half_extent_m, load_matcher
+from learned.matcher import MapMatcher, SearchRegion, largest_half_extent_m, load_matcher
 from learned.pooled import PooledMatcher
 from learned.rotmatch import RotMatch
 from learned.whole_map import search_over
@@ -126,14 +126,14 @@ def test_weights_that_are_none_are_refused(count, weights):
         PooledMatcher([Told(gaussian([0.0, 0.0, 0.0]))] * count, weights)
 
 
-def test_on_real_scans_it_is_better_than_either(shared_data):
-    """KITTI-360, 8 scans with the heading unknown: no error beyond 5 m, and the mean density of the truth is higher."""
+def test_on_real_scans_it_makes_no_large_mistake(shared_data):
+    """KITTI-360, 8 scans with the heading unknown: no error beyond 5 m, and in the mean none above RotMatch's."""
     from sequences.evaluate import evaluate_single_shot
     from sequences.registry import open_sequence
     from sequences.shot_protocol import ShotProtocol
 
     drive = open_sequence(shared_data("kitti360_0009"))
-    matchers = {"pooled": PooledMatcher.shipped(), "rotmatch": RotMatch.shipped()}
+    matchers: dict[str, MapMatcher] = {"pooled": PooledMatcher.shipped(), "rotmatch": RotMatch.shipped()}
     found = evaluate_single_shot(drive, matchers, ShotProtocol(20.0, 180.0, 8))["methods"]
     assert found["pooled"]["position_error_m"]["max"] < 5.0
     assert found["pooled"]["position_error_m"]["mean"] < found["rotmatch"]["position_error_m"]["mean"] + 0.1
