@@ -1,5 +1,7 @@
 """Smoothing online: what an update costs after a drive of so many, a lag of 100 poses; GTSAM's own smoother beside it.
 
+The incremental smoother, which keeps the whole drive, is timed to 10,000 poses.
+
 An update is a pose with its odometry and its measurement, a Gaussian; none is an outlier and odometry has no robust
 loss, so that both minimise the same. skyfix relinearises every pose and gives all 100 with their covariances; GTSAM's
 incremental smoother relinearises those that have moved and is asked for the newest pose alone. Once more, skyfix gets
@@ -17,12 +19,22 @@ import numpy as np
 
 from benchmarks.runner import Candidate, Case
 from benchmarks.smoother import patch_around
-from fusion import FixedLagSettings, FixedLagSmoother, GaussianMixture, LagState, OdometryIncrement, se2
+from fusion import (
+    FixedLagSettings,
+    FixedLagSmoother,
+    GaussianMixture,
+    IncrementalSettings,
+    IncrementalSmoother,
+    LagState,
+    OdometryIncrement,
+    se2,
+)
 from fusion.arrays import FloatArray
 from fusion.graph.covariances import noises_of
 from fusion.graph.measurements import Measurement
 
 SIZES = (100, 1_000, 10_000, 100_000)
+_MOST_KEPT = 10_000
 LAG = 100
 UPDATES = 20
 """That are timed together."""
@@ -133,21 +145,42 @@ class GtsamRun:
         return work
 
 
+class IncrementalRun:
+    """The smoother of the whole drive, which goes on from wherever it is."""
+
+    def __init__(self) -> None:
+        settings = IncrementalSettings(outlier_probability=0.0, huber_width=np.inf)
+        self._smoother = IncrementalSmoother(0, np.zeros(3), _START, settings)
+
+    def update(self, increment: OdometryIncrement, gaussian: GaussianMixture) -> FloatArray:
+        """One update, and the newest pose."""
+        self._smoother.add_odometry(increment)
+        self._smoother.add_likelihood(increment.stamp_ns, gaussian)
+        return self._smoother.estimate().pose
+
+    def prepare(self, size: int) -> Callable[[], FloatArray]:
+        """The updates after a history of at least `size`, and the newest pose."""
+        for index in range(len(self._smoother), size + 1):
+            self.update(*update_at(index))
+        first = len(self._smoother)
+        given = [update_at(index) for index in range(first, first + UPDATES)]
+        return lambda: [self.update(*one) for one in given][-1]
+
+
 def cases(sizes: Sequence[int] = SIZES, whole: int = 1_000) -> Iterator[Case]:
     """One case a length of history, and one with whole likelihoods."""
     assert all(a < b for a, b in pairwise(sizes))
-    gaussians, peer, cells = SkyfixRun(lambda one: one), GtsamRun(), SkyfixRun(patch_around)
+    gaussians, peer, cells, kept = SkyfixRun(lambda one: one), GtsamRun(), SkyfixRun(patch_around), IncrementalRun()
     for size in sizes:
-        yield _case(f"{UPDATES} updates, lag {LAG}", size, gaussians, peer)
-    yield _case(f"{UPDATES} updates, lag {LAG}, cells", whole, cells, GtsamRun())
+        yield _case(f"{UPDATES} updates, lag {LAG}", size, gaussians, peer, kept if size <= _MOST_KEPT else None)
+    yield _case(f"{UPDATES} updates, lag {LAG}, cells", whole, cells, GtsamRun(), None)
 
 
-def _case(name: str, size: int, run: SkyfixRun, peer: GtsamRun) -> Case:
-    return Case(
-        name,
-        size,
-        (
-            Candidate("skyfix fixed lag, all poses with covariances", lambda: run.prepare(size)),
-            Candidate("GTSAM incremental fixed lag, newest pose only", lambda: peer.prepare(size)),
-        ),
-    )
+def _case(name: str, size: int, run: SkyfixRun, peer: GtsamRun, kept: IncrementalRun | None) -> Case:
+    candidates = [
+        Candidate("skyfix fixed lag, all poses with covariances", lambda: run.prepare(size)),
+        Candidate("GTSAM incremental fixed lag, newest pose only", lambda: peer.prepare(size)),
+    ]
+    if kept is not None:
+        candidates.append(Candidate("skyfix incremental, the whole drive kept", lambda: kept.prepare(size)))
+    return Case(name, size, tuple(candidates))

@@ -192,11 +192,13 @@ def test_the_grid_filter_s_peer_has_the_same_moments_and_evidence() -> None:
 def test_fixed_lag_smoothers_find_the_same_poses() -> None:
     """Over several lags; GTSAM relinearises only what has moved by a tenth."""
     ours, peer = fixed_lag.SkyfixRun(lambda one: one), fixed_lag.GtsamRun()
-    whole = fixed_lag.SkyfixRun(smoother.patch_around)
+    whole, kept = fixed_lag.SkyfixRun(smoother.patch_around), fixed_lag.IncrementalRun()
     for size in (1, 90, 210):
         found = ours.after(size).estimate().pose
         np.testing.assert_allclose(found, fixed_lag.truth_at(size), atol=1.5)
         np.testing.assert_allclose(whole.after(size).estimate().pose, found, atol=0.02)
+        if size == 210:
+            np.testing.assert_allclose(kept.prepare(size - 20)(), found, atol=0.02)
         peer.prepare(size)
         np.testing.assert_allclose(peer.pose, found, atol=0.01)
 
