@@ -14,8 +14,9 @@ likelihood may come as late as it likes, and memory grows with the drive: where 
 `FixedLagSmoother`.
 """
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Self
 
 import gtsam
@@ -31,11 +32,11 @@ from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.graph.covariances import noises_of
 from fusion.graph.isam_graph import IsamGraph, Name
-from fusion.graph.lag_window import KeptMeasurement, divided, kept_measurement
-from fusion.graph.measurements import Measurement, Measurements
+from fusion.graph.kept_sites import KeptSite, KeptSites
+from fusion.graph.lag_window import divided, kept_measurement
+from fusion.graph.measurements import Measurement
 from fusion.graph.other_factors import OtherFactor
 from fusion.graph.patch import LikelihoodPatch
-from fusion.graph.sites import Sites, deviations
 from fusion.odometry import OdometryIncrement
 from fusion.prior import UniformPrior
 from fusion.tracking.tracker_input import check_likelihood, checked_increment, checked_stamp
@@ -44,8 +45,6 @@ from fusion.trajectory import Trajectory
 
 __all__ = ["IncrementalSettings", "IncrementalSmoother"]
 
-_DAMPING = 0.85
-_STALE = 0.1  # change of a cavity, in its standard deviations and as a share of its covariance
 _WIDENINGS = (16.0, 4.0, 1.0)  # of the loss of what has just joined: what fits no drifted estimate may fit in the end
 _MOST_ROUNDS = 10
 
@@ -83,16 +82,6 @@ class IncrementalSettings:
             raise SkyfixError(f"huber_width: expected > 0, got {self.huber_width}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """A measurement, its site (reference, precision, information), and the cavity under which that was found."""
-
-    measurement: KeptMeasurement
-    site: Sites
-    centre: FloatArray
-    width: FloatArray
-
-
 class IncrementalSmoother:
     """A whole drive, online.
 
@@ -128,7 +117,7 @@ class IncrementalSmoother:
         self._last_log_evidence = 0.0
         self._stamps, self._keys = [checked_stamp(stamp_ns)], [0]
         self._motions: dict[int, tuple[FloatArray, FloatArray]] = {}  # by the key of the pose where they end
-        self._seen: dict[int, _Seen] = {}
+        self._sites = KeptSites(self.settings.outlier_probability, self.settings.clutter_log_density)
         self._others: list[OtherFactor] = []
         self._graph = IsamGraph()
         [mean_], [noise] = start.means, noises_of(start.covariances, start.means[:, 2])
@@ -195,9 +184,9 @@ class IncrementalSmoother:
         if stamp_ns < self._stamps[0]:
             return self._counted("too_late_likelihoods", False)
         place = int(np.searchsorted(self._stamps, stamp_ns))
-        if self._stamps[place] == stamp_ns and self._keys[place] in self._seen:
+        if self._stamps[place] == stamp_ns and self._keys[place] in self._sites:
             return self._counted("duplicates", True)
-        late = any(key in self._seen for key in self._keys[place:])
+        late = any(key in self._sites for key in self._keys[place:])
         expected = self._expected(place, stamp_ns)
         after = self._graph.poses([self._keys[place]])
         kept = kept_measurement(likelihood, expected, self._graph.covariances([self._keys[place]], after)[0])
@@ -206,11 +195,9 @@ class IncrementalSmoother:
         key = self._keys[place]
         poses = self._graph.poses([key])
         widths = self._graph.covariances([key], poses)
-        site, log_masses = self._sites([kept], poses, widths)
-        log_evidence = float(log_masses[0])
-        self._take({key: _Seen(kept, site, poses[0], widths[0])})
-        measured = [one for one in self._keys if one in self._seen] if late else self._newest()
-        self._refresh(measured, 1)
+        site, log_evidence = self._sites.first(kept, poses[0], widths[0])
+        self._take({key: site})
+        self._refresh(self._sites.among(self._keys) if late else self._newest(), 1)
         self.log_evidence += log_evidence
         self._last_log_evidence = log_evidence
         self._count("likelihoods")
@@ -235,7 +222,7 @@ class IncrementalSmoother:
             raise SkyfixError(f"factor: expected different nodes in [0, {len(self)}), got {nodes}")
         keys = [self._keys[node] for node in nodes]
         name = "other", len(self._others)
-        measured = [key for key in self._keys if key in self._seen]
+        measured = self._sites.among(self._keys)
         try:
             for widening in _WIDENINGS:
                 self._graph.update({name: other.factor(widening, *keys)})
@@ -294,67 +281,23 @@ class IncrementalSmoother:
         self._stamps.insert(place, stamp_ns)
         self._keys.insert(place, key)
 
-    def _sites(self, kept: list[KeptMeasurement], centres: FloatArray, widths: FloatArray) -> tuple[Sites, FloatArray]:
-        """Sites of measurements under cavities (M, 3) and (M, 3, 3), and the ln of their means under these (M,)."""
-        seen = Measurements(kept, self.settings.outlier_probability, self.settings.clutter_log_density)
-        order = seen.nodes
-        found, _ = seen.windowed(centres[order], widths[order])
-        back = np.argsort(order)
-        return Sites(centres[order], *found.factors()).at(back), found.log_mass[back]
-
-    def _take(self, seen: dict[int, _Seen]) -> None:
+    def _take(self, sites: Mapping[int, KeptSite]) -> None:
         """Measurements with their sites, new or in place of what they were."""
-        factors: dict[Name, gtsam.NonlinearFactor] = {}
-        for key, one in seen.items():
-            [precision], [information] = one.site.on_body_axes()
-            at = gtsam.Values()
-            at.insert(key, gtsam.Pose2(*one.site.reference[0]))
-            quadratic = gtsam.HessianFactor(key, precision, information, 0.0)
-            factors["site", key] = gtsam.LinearContainerFactor(quadratic, at)
-        self._graph.update(factors)
-        self._seen.update(seen)
+        self._graph.update({("site", key): one.factor(key) for key, one in sites.items()})
+        self._sites.update(sites)
 
     def _newest(self) -> list[int]:
-        measured: list[int] = []
-        for key in reversed(self._keys):
-            if key in self._seen:
-                measured.append(key)
-                if len(measured) == self.settings.newest:
-                    break
-        return measured[::-1]
+        """Keys of the newest measurements."""
+        return list(islice((key for key in reversed(self._keys) if key in self._sites), self.settings.newest))
 
     def _refresh(self, keys: list[int], most_rounds: int) -> None:
         """Find sites anew whose cavities have moved, until none has."""
-        for _ in range(most_rounds):
-            if not keys or not (stale := self._stale(keys)):
+        for _ in range(most_rounds if keys else 0):
+            poses = self._graph.poses(keys)
+            stale = self._sites.stale(keys, poses, self._graph.covariances(keys, poses))
+            if not stale:
                 break
             self._take(stale)
-
-    def _stale(self, keys: list[int]) -> dict[int, _Seen]:
-        """Those of some measurements whose cavities have moved since their sites were found, with new sites."""
-        ones = [self._seen[key] for key in keys]
-        poses = self._graph.poses(keys)
-        sites = _together(one.site for one in ones)
-        centres, widths = sites.cavities(poses, self._graph.covariances(keys, poses))
-        before = np.array([one.centre for one in ones]), np.array([one.width for one in ones])
-        off = deviations(centres, before[0])
-        moved = np.sqrt(np.einsum("mi,mij,mj->m", off, np.linalg.inv(widths), off))
-        sigma = np.sqrt(np.diagonal(widths, axis1=1, axis2=2))
-        reshaped = np.abs((widths - before[1]) / (sigma[:, :, None] * sigma[:, None, :])).max(axis=(1, 2))
-        chosen = np.flatnonzero(np.maximum(moved, reshaped) > _STALE)
-        if len(chosen) == 0:
-            return {}
-        fresh, _ = self._sites([ones[k].measurement for k in chosen], centres[chosen], widths[chosen])
-        mixed = sites.at(chosen).mixed(fresh, _DAMPING)
-        return {
-            keys[k]: _Seen(
-                ones[k].measurement,
-                mixed.at(np.array([m])),
-                before[0][k] + _DAMPING * off[k],
-                (1.0 - _DAMPING) * before[1][k] + _DAMPING * widths[k],
-            )
-            for m, k in enumerate(chosen.tolist())
-        }
 
     def _counted(self, name: str, is_duplicate: bool) -> LagReport:
         self._count(name)
@@ -362,9 +305,3 @@ class IncrementalSmoother:
 
     def _count(self, name: str) -> None:
         self.counts = replace(self.counts, **{name: getattr(self.counts, name) + 1})
-
-
-def _together(sites: Iterable[Sites]) -> Sites:
-    parts = list(sites)
-    names = ("reference", "precision", "information")
-    return Sites(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
