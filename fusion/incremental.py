@@ -9,11 +9,12 @@
 
 The graph is solved by GTSAM's ISAM2, which works again on what a message changes and no more. Whole likelihoods count
 as they do in `fusion.factor_graph.smooth`: each stands in the graph as the Gaussian that has its effect, found anew as
-the estimate moves; of the newest ones in every update, of all when a loop closes. Nothing is summed over, so a
-likelihood may come as late as it likes, and memory grows with the drive: where it must not, and no loop can close, take
-`FixedLagSmoother`.
+the estimate moves; of the newest ones in every update, of all when a loop closes or one comes late. Nothing is summed
+over, so a likelihood may come as late as it likes, and memory grows with the drive: where it must not, and no loop can
+close, take `FixedLagSmoother`.
 """
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -183,7 +184,7 @@ class IncrementalSmoother:
             raise SkyfixError(f"likelihood: expected a stamp up to the odometry's {self._stamps[-1]}, got {stamp_ns}")
         if stamp_ns < self._stamps[0]:
             return self._counted("too_late_likelihoods", False)
-        place = int(np.searchsorted(self._stamps, stamp_ns))
+        place = bisect_left(self._stamps, stamp_ns)
         if self._stamps[place] == stamp_ns and self._keys[place] in self._sites:
             return self._counted("duplicates", True)
         late = any(key in self._sites for key in self._keys[place:])
