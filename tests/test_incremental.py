@@ -8,6 +8,8 @@ from test_graph_other_factors import TIGHT, circle
 
 from fusion import (
     AbsoluteFix,
+    FixedLagSettings,
+    FixedLagSmoother,
     GaussianLikelihood,
     GaussianMixture,
     IncrementalSettings,
@@ -149,6 +151,20 @@ def test_odometry_is_divided_for_a_likelihood_between_poses(share):
     np.testing.assert_allclose(after.poses[3], between, atol=2e-3)
     smoother.add(AbsoluteFix(3, between[:2] + [0.3, 0.0], np.eye(2) * 1e-6))
     np.testing.assert_allclose(smoother.trajectory().poses[3, :2], between[:2] + [0.3, 0.0], atol=2e-2)
+    assert smoother.weights()[0] > 0.9  # the residual of the pose that it was put on
+
+
+def test_a_registration_that_failed_is_held_against_by_hubers_loss():
+    """As the fixed-lag smoother with the same loss and a lag longer than the drive."""
+    _, increments, truth, rng = drive(30, 12)
+    bad = increments[15]
+    increments[15] = OdometryIncrement(bad.stamp_ns, bad.delta + [4.0, 1.5, 0.2], bad.covariance)
+    likelihoods, prior = gaussians(truth, rng), UniformPrior(truth[0], 5.0, 0.3)
+    smoother = IncrementalSmoother.from_prior(0, prior, IncrementalSettings(outlier_probability=0.0))
+    lagged = FixedLagSmoother.from_prior(0, prior, FixedLagSettings(outlier_probability=0.0))
+    fed(smoother, increments, likelihoods)
+    fed(lagged, increments, likelihoods)
+    np.testing.assert_allclose(smoother.trajectory().poses, lagged.trajectory().poses, atol=0.03)
 
 
 def test_what_was_there_already_or_before_the_drive_changes_nothing():

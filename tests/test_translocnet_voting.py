@@ -25,7 +25,7 @@ from fusion.errors import SkyfixError
 from learned.architectures import ARCHITECTURES
 from learned.backbone import BackboneSettings
 from learned.calibration import Calibration
-from learned.checkpoint import load_initial, save_network
+from learned.checkpoint import InitialWeights, load_initial, save_network
 from learned.training_settings import NetworkChoice, TrainingSettings
 from learned.training_state import TrainingState
 from learned.translocnet_voting import ARCHITECTURE, EncoderVoteMatcher, EncoderVoteNet, EncoderVoteSettings
@@ -108,6 +108,15 @@ def test_encoders_of_other_sizes_and_other_networks_are_refused(tmp_path: Path) 
         state.start_from(load_initial(vote_checkpoint(tmp_path), COMPACT))
     with pytest.raises(SkyfixError, match="expected architecture hybrid-1, got translocnet-voting-1"):
         load_initial(vote_checkpoint(tmp_path), ARCHITECTURES["hybrid"])
+
+
+def test_a_checkpoint_of_the_network_itself_has_to_hold_all_of_it() -> None:
+    """Parts alone are taken from what pre-trains it, and from nothing else."""
+    state = TrainingState(TrainingSettings(network=NetworkChoice("translocnet-voting")), torch.device("cpu"))
+    whole = state.net.state_dict()
+    state.start_from(InitialWeights(whole))
+    with pytest.raises(SkyfixError, match="the initial weights do not fit the network"):
+        state.start_from(InitialWeights({name: value for name, value in whole.items() if name != "log_scale"}))
 
 
 def test_settings_are_read_back() -> None:
