@@ -52,7 +52,8 @@ def test_with_gaussians_it_is_the_offline_smoother():
 
 
 def test_with_whole_likelihoods_too_it_is_the_offline_smoother():
-    """Two peaks each, and outliers: to a tenth of a standard deviation."""
+    """Two peaks each, and outliers; in time to a tenth of a standard deviation, and from the newest to the oldest, so
+    that every site but the first is found again from what comes late, closer still."""
     stamps, increments, truth, rng = drive(14, 2, step=(1.5, 0.0, 0.05))
     grid, likelihoods = MapGrid(40, 40, 1.0, -8.0, -10.0), []
     for pose in truth:
@@ -60,13 +61,21 @@ def test_with_whole_likelihoods_too_it_is_the_offline_smoother():
         both = GaussianMixture(np.array([0.6, 0.4]), np.array([at, at + [0.0, 9.0, 0.0]]), np.array([SEEN, SEEN]))
         likelihoods.append(volume(both, grid, 60))
     prior = UniformPrior(truth[0], 2.0, 0.3)
-    smoother = IncrementalSmoother.from_prior(0, prior, IncrementalSettings(huber_width=np.inf))
-    fed(smoother, increments, likelihoods)
     settings = SmootherSettings(odometry_kernel="none")
     offline = smooth(stamps, increments, likelihoods, prior, rough(stamps, truth), settings).trajectory
+    smoother = IncrementalSmoother.from_prior(0, prior, IncrementalSettings(huber_width=np.inf))
+    fed(smoother, increments, likelihoods)
     off, widths = in_sigmas(smoother.trajectory(), offline)
     np.testing.assert_allclose(off, 0.0, atol=0.1)
     np.testing.assert_allclose(widths, 1.0, atol=0.1)
+    late = IncrementalSmoother.from_prior(0, prior, IncrementalSettings(newest=1, huber_width=np.inf))
+    for increment in increments:
+        late.add_odometry(increment)
+    for k in reversed(range(14)):
+        late.add_likelihood(k * SECOND, likelihoods[k])
+    off, widths = in_sigmas(late.trajectory(), offline)
+    np.testing.assert_allclose(off, 0.0, atol=0.03)
+    np.testing.assert_allclose(widths, 1.0, atol=2e-3)
 
 
 @pytest.mark.parametrize("likelihoods", [False, True])
