@@ -15,6 +15,7 @@ import typer
 
 from fusion.errors import SkyfixError
 from sequences.cli_ablate import ablate
+from sequences.cli_bag import bag
 from sequences.cli_emulate import emulate
 from sequences.cli_evaluate import evaluate
 from sequences.cli_map import draw_map
@@ -79,6 +80,12 @@ app.command(
     "map",
     epilog="Example: `skyfix map karlsruhe.osm.pbf drives/mine --origin 49.0116 8.4169 --half-extent 800`",
 )(draw_map)
+
+app.command(
+    epilog="Examples:\n\n"
+    "`skyfix bag drive.bag drives/mine`\n\n"
+    "`skyfix bag recording drives/mine --scans /velodyne_points --odometry /kiss/odometry --every 5`"
+)(bag)
 
 
 @app.command(epilog="Example: `skyfix convert KITTI/raw_data/2011_09_26/2011_09_26_drive_0013_sync drives/kitti_13`")
