@@ -27,7 +27,7 @@ class MapSearchSettings:
         Cells this far below the best are not looked at closely.
     contrast_cell_m, contrast_heading_deg, contrast_places
         Wanted size of a cell where only the contrast is asked for, and how many places are then looked at closely:
-        coarser and fewer, as it is asked for often.
+        coarser, as it is asked for often.
     """
 
     cell_m: float = 3.0
@@ -36,7 +36,7 @@ class MapSearchSettings:
     range_nats: float = 12.0
     contrast_cell_m: float = 5.0
     contrast_heading_deg: float = 9.0
-    contrast_places: int = 6
+    contrast_places: int = 24
 
     def __post_init__(self) -> None:
         if not all(getattr(self, entry.name) > 0 for entry in fields(self)):

@@ -27,8 +27,6 @@ from learned.correlation import MapCorrelator, fast_length, template_spectrum
 from learned.map_lattice import MapLattice, MapSearchSettings, bins_together, odd_near
 from learned.voting import prior_scores, rotate_templates
 
-_NEAR_M, _NEAR_RAD = 10.0, math.radians(10.0)
-
 
 class MapSearch:
     """A map's features, ready to be searched with scans.
@@ -82,26 +80,27 @@ class MapSearch:
         lifted = coarse + np.float32(np.median(gained))
         return TwoLevelLikelihood.from_scores(lifted, self.lattice.coarse, cut, fine)
 
-    def contrast(self, scan: Tensor, pose: FloatArray) -> float:
-        """Highest score on the map less the highest near a pose (3,): within some 10 m and 10 degrees.
+    def contrast(self, scan: Tensor, pose: FloatArray, reach: FloatArray) -> float:
+        """Highest score on the map less the highest within `reach` (3,) of a pose (3,): metres, metres, radians.
 
-        Coarse scores say where to look closely: at the best few places of the map, and at the best one near the pose.
+        Coarse scores say where to look closely: at the best few places of the map, at the best one near the pose, and
+        at the pose.
         """
-        lattice, vote = self.lattice, self._contrast
+        vote = self._contrast
         with torch.inference_mode():
             scores = vote.scores(scan) / np.float32(self._temperature)
             centres = self._best_places(scores, self.settings.contrast_places)
-            about = _near(pose, vote.grid, vote.bins)
+            about = _near(pose, reach, vote.grid, vote.bins)
             if all(len(axis) for axis in about):
                 row, col, turn = np.unravel_index(np.argmax(scores[np.ix_(*about)]), [len(axis) for axis in about])
                 centres = np.concatenate([centres, [[about[0][row], about[1][col], about[2][turn]]]])
             xy = vote.grid.xy_from_pixel(centres[:, :2] + 0.5)
             places = np.concatenate([np.column_stack([xy, centres[:, 2] * (se2.TWO_PI / vote.bins)]), pose[None]])
             cut, fine = self._closely(scan, np.unique(self._cells_of(places), axis=0))
-        highest = fine.max(axis=(1, 2, 3))
-        about = _near(pose, lattice.coarse, self._yaw_bins // lattice.turn)
-        is_near = np.all([np.isin(cut[:, axis], about[axis]) for axis in range(3)], axis=0)
-        return float(highest.max() - highest.max(where=is_near, initial=fine.min()))
+        offset = self._fine_poses(cut) - pose
+        offset[..., 2] = se2.wrap(offset[..., 2])
+        is_near = (np.abs(offset) <= reach).all(axis=-1)
+        return float(fine.max() - fine.max(where=is_near, initial=fine.min()))
 
     def _coarse_scores(self, scan: Tensor) -> Float32Array:
         """(rows, cols, K) on the coarse cells."""
@@ -130,6 +129,17 @@ class MapSearch:
         yaw = np.rint(poses[:, 2] * bins / se2.TWO_PI).astype(np.int64) % bins
         inside = ((row_col >= 0) & (row_col < [grid.rows, grid.cols])).all(axis=1)
         return np.column_stack([row_col, yaw])[inside]
+
+    def _fine_poses(self, cut: IntArray) -> FloatArray:
+        """Poses (M, side, side, turn, 3) in the middle of the fine cells of coarse ones (M, 3)."""
+        side, turn, grid = self.lattice.side, self.lattice.turn, self.lattice.coarse
+        within = (np.arange(side) + 0.5) / side
+        row, col = (cut[:, axis, None] + within for axis in (0, 1))
+        yaw = (cut[:, 2, None] * turn + np.arange(turn) - turn // 2) * (se2.TWO_PI / self._yaw_bins)
+        shape = (len(cut), side, side, turn)
+        row, col, yaw = row[:, :, None, None], col[:, None, :, None], yaw[:, None, None, :]
+        at = np.stack([np.broadcast_to(axis, shape) for axis in (row, col)], axis=-1)
+        return np.concatenate([grid.xy_from_pixel(at), np.broadcast_to(yaw, shape)[..., None]], axis=-1)
 
     def _closely(self, scan: Tensor, centres: IntArray) -> tuple[IntArray, Float32Array]:
         """The cells (M, 3) at and beside `centres`, and the scores (M, side, side, turn) of their fine cells."""
@@ -191,14 +201,15 @@ class _TurnedTemplates:
         return self._known[base], self._scan.shape[-1], turns
 
 
-def _near(pose: FloatArray, grid: MapGrid, bins: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Rows, columns and yaw bins of the cells of a grid within some 10 m and 10 degrees of a pose (3,)."""
-    reach, half_turn = round(_NEAR_M / grid.metres_per_pixel), round(_NEAR_RAD * bins / se2.TWO_PI)
+def _near(pose: FloatArray, reach: FloatArray, grid: MapGrid, bins: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Rows, columns and yaw bins of the cells of a grid within reach (3,) of a pose (3,)."""
+    across, down = (round(float(metres) / grid.metres_per_pixel) for metres in reach[:2])
+    half_turn = round(float(reach[2]) * bins / se2.TWO_PI)
     row, col = (math.floor(at) for at in grid.pixel_from_xy(pose[:2]))
     turn = round(float(pose[2]) * bins / se2.TWO_PI)
     return (
-        np.arange(max(row - reach, 0), min(row + reach + 1, grid.rows)),
-        np.arange(max(col - reach, 0), min(col + reach + 1, grid.cols)),
+        np.arange(max(row - down, 0), min(row + down + 1, grid.rows)),
+        np.arange(max(col - across, 0), min(col + across + 1, grid.cols)),
         np.arange(turn - half_turn, turn + half_turn + 1) % bins,
     )
 

@@ -38,8 +38,16 @@ class WholeMapSearch(Protocol):
         """
         ...
 
-    def contrast(self, points: NDArray[np.float32], ground_z: float, pose: FloatArray) -> float:
-        """By how many nats the best place on the map fits one scan better than the best near a pose (3,)."""
+    def contrast(self, points: NDArray[np.float32], ground_z: float, pose: FloatArray, reach: FloatArray) -> float:
+        """By how many nats the best place on the map fits one scan better than the best within reach of a pose.
+
+        Parameters
+        ----------
+        points, ground_z
+            As in `learned.matcher.MapMatcher.match`.
+        pose, reach
+            (3,) each: a box of `reach` to both sides of the pose, metres, metres, radians.
+        """
         ...
 
 
@@ -89,7 +97,7 @@ class VotedMapSearch:
         scan, search = self.features(bev_counts(points, ground_z, self.bev))
         return search.likelihood(scan, near)
 
-    def contrast(self, points: NDArray[np.float32], ground_z: float, pose: FloatArray) -> float:
+    def contrast(self, points: NDArray[np.float32], ground_z: float, pose: FloatArray, reach: FloatArray) -> float:
         """See `WholeMapSearch.contrast`."""
         scan, search = self.features(bev_counts(points, ground_z, self.bev))
-        return search.contrast(scan, pose)
+        return search.contrast(scan, pose, reach)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion.arrays import Float32Array, FloatArray
+from fusion.arrays import Float32Array
 from fusion.estimate import Estimate
 from fusion.odometry import OdometryIncrement
 from fusion.particle_filter import ParticleFilter
@@ -23,6 +23,9 @@ from sequences.start_cloud import MOST_MEASUREMENTS, StartCloud
 from sequences.track_settings import TrackSettings
 
 _LEAST_PARTICLES = 20_000  # while they are all over the map
+_NEAR_SIGMAS = 3.0
+_NEAR = np.array([[2.0, 2.0, np.radians(5.0)], [10.0, 10.0, np.radians(10.0)]])
+"""Least and most that counts as near the filter's pose: metres, metres, radians."""
 
 
 class AnywhereSearch:
@@ -74,9 +77,13 @@ class AnywhereSearch:
         box = map_box(self._map.grid)
         return SearchRegion(box.mean, box.half_extent_m, box.half_heading_rad)
 
-    def contrast(self, points: Float32Array, pose: FloatArray) -> float:
-        """See `learned.whole_map.WholeMapSearch.contrast`."""
-        return self._prepared().contrast(points, self._ground_z, pose)
+    def contrast(self, points: Float32Array, estimate: Estimate) -> float:
+        """By how many nats a scan fits elsewhere on the map better than where the filter has the vehicle.
+
+        What is near is not more than the filter leaves open: in 10 m about a wrong place, something fits.
+        """
+        reach = np.clip(_NEAR_SIGMAS * np.sqrt(np.diag(estimate.covariance)), *_NEAR)
+        return self._prepared().contrast(points, self._ground_z, estimate.pose, reach)
 
     def match(self, points: Float32Array, particles: ParticleFilter | None) -> TwoLevelLikelihood:
         """Likelihood of all poses on the map, looked at closely about the particles too."""

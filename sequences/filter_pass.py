@@ -257,7 +257,7 @@ class FilterPass:
         is_due = self._plan.phase is Phase.LOST or self._watch.is_due(self._travelled_m)
         if not (is_due and self._plan.follows_filter and self._prepare_whole_map(frame)):
             return
-        contrast = self._anywhere.contrast(measurement.points, particles.estimate(self._stamp(frame)).pose)
+        contrast = self._anywhere.contrast(measurement.points, particles.estimate(self._stamp(frame)))
         if self._watch.record(self._travelled_m, contrast) > self._settings.search.lost_threshold:
             self._plan.give_up()
             self._note(frame, f"searching for {self._plan.phase.value}: this scan fits elsewhere")

@@ -73,7 +73,9 @@ class EmulatedMapSearch:
         )
         return TwoLevelLikelihood.from_scores(coarse, coarse_grid, cut, fine)
 
-    def contrast(self, points: NDArray[np.float32], ground_z: float, pose: NDArray[np.float64]) -> float:
+    def contrast(
+        self, points: NDArray[np.float32], ground_z: float, pose: NDArray[np.float64], reach: NDArray[np.float64]
+    ) -> float:
         index = round(float(points[0, 3]) * 1000)
         return 0.0 if np.hypot(*(self.truth[index] - pose)[:2]) < 10.0 else 8.0
 
