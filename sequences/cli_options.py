@@ -58,7 +58,7 @@ WatchMapOption = Annotated[
         "--watch-map-every",
         help="Compare a scan with the whole map every so many metres, to notice that the vehicle was carried "
         "elsewhere; 4 notices it soon. Doubles the cost, and raises false alarms on maps that show little. "
-        "0: never.",
+        "0: only for 100 m after it was looked for on the whole map.",
         metavar="M",
     ),
 ]

@@ -48,8 +48,9 @@ class TrackSettings:
         OpenStreetMap is traced from aerial images that are a few decimetres off.
     map_check_every_m
         While the vehicle is tracked, a scan is compared with the whole map every so many metres (see `map_watch`),
-        where the matcher can; 0 for never. It decides on nothing but whether the vehicle is lost, and is the only way
-        to notice that it was carried to a place that looks alike; where many places do, it raises false alarms.
+        where the matcher can; with 0 only for a while after it was found on the whole map. It decides on nothing but
+        whether the vehicle is lost, and is the only way to notice that it was carried to a place that looks alike;
+        where many places do, it raises false alarms.
     snapshots
         Measured frames kept for the report.
     search, filter, smoother

@@ -226,6 +226,29 @@ def test_a_matcher_that_cannot_says_so_in_one_line_and_goes_on(long_drive: MadeD
         run(kidnapped(long_drive), long_drive, EmulatedMatcher, start_anywhere=True)
 
 
+@pytest.mark.parametrize("every_m", [0.0, 4.0])
+def test_a_wrong_place_that_was_found_is_given_up_again_without_a_watch_too(
+    long_drive: MadeDrive, monkeypatch: pytest.MonkeyPatch, every_m: float
+) -> None:
+    settle, wrong = AnywhereSearch.settle, []
+
+    def settled(search: AnywhereSearch, particles: ParticleFilter) -> ParticleFilter:
+        right = settle(search, particles)
+        if wrong:
+            return right
+        wrong.append(right.particles + [0.0, 60.0, 0.0])
+        return ParticleFilter(wrong[0], 0, SETTINGS.filter)
+
+    monkeypatch.setattr(AnywhereSearch, "settle", settled)
+    settings = replace(SETTINGS, odometry="wheels", start_anywhere=True, map_check_every_m=every_m)
+    found = track(FolderSequence(long_drive.path), MapWideMatcher(long_drive.truth.poses), settings)
+    errors = errors_of(found)
+    assert errors[:60].max() > 40.0
+    assert errors[-20:].max() < 2.5
+    assert sum("found at" in line for line in found.log) == 2
+    assert sum("this scan fits elsewhere" in line for line in found.log) == 1
+
+
 def test_settings_of_a_start_anywhere_are_checked() -> None:
     with pytest.raises(SkyfixError, match="start: expected none with start_anywhere"):
         TrackSettings("wheels", start=(0.0, 0.0, 0.0), start_anywhere=True)
@@ -291,6 +314,18 @@ def test_the_watch_needs_more_than_one_scan_that_fits_elsewhere_a_little() -> No
     watch.restart(424.0, 0.1)
     assert watch.is_due(424.5)  # a place found with one chance in ten of another is looked at again at once
     assert not MapWatch(0.0, 1e5).is_due(1e6)
+
+
+def test_a_place_that_was_found_is_on_probation_without_a_watch() -> None:
+    watch = MapWatch(0.0, 1e5)
+    watch.restart(500.0, 0.0)
+    assert not watch.is_due(503.9)
+    for way_m in range(504, 600, 4):
+        assert watch.is_due(float(way_m))
+        watch.record(float(way_m), 0.0)
+    assert not watch.is_due(600.0)
+    watch.record(600.0, 1e3)
+    assert watch.is_due(601.0)  # nothing is left in suspicion
     assert not MapWatch(4.0, 5e6).is_due(19.0)
 
 
