@@ -13,7 +13,7 @@ folder, and `skyfix map` adds its map. Messages are read by the package rosbags 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -156,8 +156,16 @@ class Bag:
 
     def _messages(self, topic: str) -> Iterator[Any]:
         connections = [connection for connection in self._reader.connections if connection.topic == topic]
-        for connection, _, raw in self._reader.messages(connections=connections):
-            yield self._reader.deserialize(raw, connection.msgtype)
+        stored = self._reader.messages(connections=connections)
+        while True:
+            try:
+                connection, _, raw = next(stored)
+                message = self._reader.deserialize(raw, connection.msgtype)
+            except StopIteration:
+                return
+            except Exception as error:  # the package raises many kinds at a broken file
+                raise SkyfixError(f"{self._path} {topic}: cannot be read: {error or type(error).__name__}") from error
+            yield message
 
 
 @contextmanager
@@ -170,7 +178,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         If the package rosbags is not installed, there is no bag, or it cannot be read.
     """
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise SkyfixError(
@@ -178,12 +186,13 @@ def open_bag(path: Path) -> Iterator[Bag]:
         ) from error
     if not path.exists():
         raise SkyfixError(f"{path}: expected a ROS bag (a .bag file or a folder with metadata.yaml), got nothing")
-    try:
-        # The default types are for bags that do not carry their own, as ROS 2's before Iron.
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            yield Bag(path, reader)
-    except AnyReaderError as error:
-        raise SkyfixError(f"{path}: cannot be read as a ROS bag: {error}") from error
+    # The default types are for bags that do not carry their own, as ROS 2's before Iron.
+    with ExitStack() as stack:
+        try:
+            reader = stack.enter_context(AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)))
+        except Exception as error:  # the package raises many kinds at a broken file
+            raise SkyfixError(f"{path}: cannot be read as a ROS bag: {error or type(error).__name__}") from error
+        yield Bag(path, reader)
 
 
 def _stamp_ns(message: Any) -> int:

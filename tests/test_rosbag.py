@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from made_bag import KINDS, MOUNTED_AT, MOUNTED_YAW, START_NS, STEP_NS, MadeBag, cloud_message, scan
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 
 from fusion import se2
@@ -130,6 +132,24 @@ def test_what_is_no_bag_is_one_clear_error(tmp_path: Path, content: bytes | None
         open_bag(path),
     ):
         pass
+
+
+def test_a_folder_without_a_bag_and_a_stump_of_a_file_are_clear_errors(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "stump.mcap").write_bytes(b"\x89MCAP0\r\n")
+    for name in ("folder", "stump.mcap"):
+        with pytest.raises(SkyfixError, match=f"{name}: cannot be read as a ROS bag"), open_bag(tmp_path / name):
+            pass
+
+
+def test_a_message_that_breaks_off_is_a_clear_error_and_leaves_nothing(tmp_path: Path) -> None:
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(tmp_path / "drive", version=9) as writer:
+        connection = writer.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=types)
+        writer.write(connection, START_NS, b"\x00\x01\x00\x00\x07")
+    with open_bag(tmp_path / "drive") as bag, pytest.raises(SkyfixError, match="drive /points: cannot be read"):
+        write_bag_folder(bag, tmp_path / "mine", BagRequest())
+    assert not (tmp_path / "mine").exists()
 
 
 @given(
