@@ -84,7 +84,7 @@ def write_bag_folder(
     Raises
     ------
     SkyfixError
-        If the folder has scans or odometry, a topic is missing, or no scan can be used.
+        If the folder has scans or odometry or cannot be written, a topic is missing, or no scan can be used.
     """
     if request.every < 1:
         raise SkyfixError(f"every: expected at least 1, got {request.every}")
@@ -96,15 +96,17 @@ def write_bag_folder(
     found = {_file_name(name): bag.odometry(bag.the_topic(name, "odometry", *ODOMETRY)) for name in wanted}
     partial, is_new = target / _PARTIAL, not target.exists()
     shutil.rmtree(partial, ignore_errors=True)
-    (partial / "scans").mkdir(parents=True)
-    (partial / "odometry").mkdir()
     try:
+        (partial / "scans").mkdir(parents=True)
+        (partial / "odometry").mkdir()
         content = _write(bag, topic, found, partial, request, progress)
         for name in ("scans", "odometry", "sensor.json"):
             (partial / name).rename(target / name)
+    except OSError as error:
+        raise SkyfixError(f"{target}: cannot be written: {error.strerror}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-        if is_new and not any(target.iterdir()):
+        if is_new and target.is_dir() and not any(target.iterdir()):
             target.rmdir()
     return content
 

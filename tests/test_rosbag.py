@@ -79,6 +79,8 @@ def test_a_map_in_the_folder_stays_and_scans_do_not_get_mixed(tmp_path: Path) ->
         assert (target / "map.json").read_text() == "{}"
         with pytest.raises(SkyfixError, match=r"one with a map alone, got one with scans, odometry, sensor\.json"):
             write_bag_folder(bag, target, BagRequest())
+        with pytest.raises(SkyfixError, match=r"map\.json: cannot be written: Not a directory"):
+            write_bag_folder(bag, target / "map.json", BagRequest())
 
 
 def test_unusable_scans_are_counted_and_without_any_nothing_is_left(tmp_path: Path) -> None:
