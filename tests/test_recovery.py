@@ -14,6 +14,7 @@ from benchmarks.recovery_drives import IncidentMaker, SplicedSequence
 from benchmarks.recovery_trials import auroc, right_after
 from fusion import se2
 from fusion.errors import SkyfixError
+from fusion.estimate import Estimate
 from fusion.grid import MapGrid
 from fusion.likelihood import PoseLikelihood
 from fusion.particle_filter import ParticleFilter
@@ -314,6 +315,34 @@ def test_the_watch_needs_more_than_one_scan_that_fits_elsewhere_a_little() -> No
     watch.restart(424.0, 0.1)
     assert watch.is_due(424.5)  # a place found with one chance in ten of another is looked at again at once
     assert not MapWatch(0.0, 1e5).is_due(1e6)
+
+
+def test_a_watch_goes_on_after_the_probation() -> None:
+    watch = MapWatch(4.0, 1e5)
+    watch.restart(500.0, 0.0)
+    assert watch.is_due(2000.0)
+
+
+def test_near_the_filter_is_what_it_leaves_open() -> None:
+    grid = MapGrid(100, 100, 1.0, 0.0, 0.0)
+    reaches: list[NDArray[np.float64]] = []
+
+    class Search(EmulatedMapSearch):
+        def contrast(self, points: Any, ground_z: float, pose: Any, reach: NDArray[np.float64]) -> float:
+            reaches.append(reach)
+            return 0.0
+
+    class Matcher(MapWideMatcher):
+        def over_map(self, map_raster: MapRaster) -> EmulatedMapSearch:
+            return Search(self.truth, grid)
+
+    bare = MapRaster.from_classes(grid, np.zeros((100, 100), np.uint8))
+    search = AnywhereSearch(Matcher(np.zeros((1, 3))), bare, -1.7, SETTINGS, np.random.default_rng(0))
+    for sigmas in ([0.1, 1.5, np.deg2rad(1.0)], [50.0, 2.5, np.deg2rad(2.5)], [1.0, 0.0, 3.0]):
+        estimate = Estimate(0, np.zeros(3), np.diag(np.square(sigmas)), None, 1.0, 0.0, 0.0)
+        search.contrast(np.zeros((1, 4), np.float32), estimate)
+    expected = [[2.0, 4.5, np.deg2rad(5.0)], [10.0, 7.5, np.deg2rad(7.5)], [3.0, 2.0, np.deg2rad(10.0)]]
+    np.testing.assert_allclose(reaches, expected)
 
 
 def test_a_place_that_was_found_is_on_probation_without_a_watch() -> None:

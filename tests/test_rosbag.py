@@ -192,7 +192,7 @@ def test_broken_clouds_are_refused() -> None:
 def test_the_ground_is_the_road_not_the_roof_or_the_wall() -> None:
     rng = np.random.default_rng(3)
     road = np.column_stack([rng.uniform(-12, 12, (2000, 2)), rng.normal(-1.6, 0.03, 2000), np.zeros(2000)])
-    deck = np.column_stack([rng.uniform(-8, 8, (1500, 2)), np.full(1500, 0.4), np.zeros(1500)])
+    deck = np.column_stack([rng.uniform(-8, 8, (2500, 2)), np.full(2500, 0.4), np.zeros(2500)])
     both = np.concatenate([road, deck]).astype(np.float32)
     assert estimate_ground_z([both]) == pytest.approx(-1.6, abs=0.02)
     with pytest.raises(SkyfixError, match="--ground-z"):
