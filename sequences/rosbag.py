@@ -116,10 +116,15 @@ class Bag:
             positions.append(_xyz(pose.position))
             rotations.append(_xyzw(pose.orientation))
         stamps_ns, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
-        values = np.array(rotations)[first]
-        if len(first) < 2 or not np.isfinite(values).all() or not (np.abs(values).sum(axis=1) > 0).all():
-            raise SkyfixError(f"{self._path} {topic}: expected two poses or more with finite quaternions, got others")
-        poses = planar(np.array(positions)[first], Rotation.from_quat(values), topic)
+        if len(first) < 2:
+            raise SkyfixError(f"{self._path} {topic}: expected at least two poses, got {len(first)}")
+        at, turned = np.array(positions)[first], np.array(rotations)[first]
+        good = np.isfinite(at).all(axis=1) & np.isfinite(turned).all(axis=1) & turned.any(axis=1)
+        if not good.all():
+            raise SkyfixError(
+                f"{self._path} {topic}: expected finite poses with a rotation, got {(~good).sum()} others"
+            )
+        poses = planar(at, Rotation.from_quat(turned), topic)
         return BagOdometry(Trajectory(stamps_ns, poses, None, topic), body)
 
     def mounting(self, body: str, sensor: str) -> FloatArray | None:
@@ -131,9 +136,7 @@ class Bag:
             for message in self._messages(topic):
                 for link in message.transforms:
                     parent, child = _name(link.header.frame_id), _name(link.child_frame_id)
-                    parent_from_child = np.eye(4)
-                    parent_from_child[:3, :3] = Rotation.from_quat(_xyzw(link.transform.rotation)).as_matrix()
-                    parent_from_child[:3, 3] = _xyz(link.transform.translation)
+                    parent_from_child = _matrix(link.transform, f"{self._path} {topic}: {parent} to {child}")
                     edges.setdefault(parent, []).append((child, parent_from_child))
                     edges.setdefault(child, []).append((parent, inverse(parent_from_child)))
         known = {_name(body): np.eye(4)}
@@ -206,6 +209,17 @@ def _xyz(vector: Any) -> list[float]:
 
 def _xyzw(quaternion: Any) -> list[float]:
     return [quaternion.x, quaternion.y, quaternion.z, quaternion.w]
+
+
+def _matrix(transform: Any, label: str) -> FloatArray:
+    """(4, 4) of a transform; `SkyfixError` when it is none."""
+    rotation, translation = _xyzw(transform.rotation), _xyz(transform.translation)
+    if not np.isfinite([*rotation, *translation]).all() or not np.any(rotation):
+        raise SkyfixError(f"{label}: expected a finite transform with a rotation, got {translation}, {rotation}")
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(rotation).as_matrix()
+    matrix[:3, 3] = translation
+    return matrix
 
 
 def _name(frame: str) -> str:

@@ -29,6 +29,8 @@ class MadeBag:
     scan_topics: tuple[str, ...] = ("/points",)
     odometry_topics: tuple[str, ...] = ("/wheels/odom",)
     linked: bool = True
+    link_rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    odometry_x0: float = 0.0
 
     def write(self, path: Path, kind: str) -> Path:
         """Write it as ROS 1's one file or ROS 2's folder."""
@@ -72,7 +74,7 @@ class MadeBag:
                 for index in range(9):
                     stamp = START_NS + index * STEP_NS // 2
                     quaternion = turn(*Rotation.from_euler("z", 0.02 * index).as_quat().tolist())
-                    pose = make["geometry_msgs/msg/Pose"](point(0.5 * index, 0.0, 0.3), quaternion)
+                    pose = make["geometry_msgs/msg/Pose"](point(self.odometry_x0 + 0.5 * index, 0.0, 0.3), quaternion)
                     odometry = make["nav_msgs/msg/Odometry"](
                         header(stamp, "odom"), "base_link", with_covariance(pose, np.zeros(36)), still
                     )
@@ -102,7 +104,7 @@ class MadeBag:
         vector, turn = make["geometry_msgs/msg/Vector3"], make["geometry_msgs/msg/Quaternion"]
         link, transform = make["geometry_msgs/msg/TransformStamped"], make["geometry_msgs/msg/Transform"]
         back = Rotation.from_euler("z", -MOUNTED_YAW)
-        mast = transform(vector(*MOUNTED_AT.tolist()), turn(0.0, 0.0, 0.0, 1.0))
+        mast = transform(vector(*MOUNTED_AT.tolist()), turn(*self.link_rotation))
         turned = transform(vector(0.0, 0.0, 0.0), turn(*back.as_quat().tolist()))
         return [link(header(START_NS, "base_link"), "mast", mast), link(header(START_NS, "/lidar"), "mast", turned)]
 

@@ -99,6 +99,17 @@ def test_unusable_scans_are_counted_and_without_any_nothing_is_left(tmp_path: Pa
     assert not (tmp_path / "none").exists()
 
 
+def test_a_broken_pose_or_mounting_is_one_clear_error(tmp_path: Path) -> None:
+    for made, message in (
+        (MadeBag(odometry_x0=np.nan), "/wheels/odom: expected finite poses with a rotation, got 9 others"),
+        (MadeBag(link_rotation=(0.0, 0.0, 0.0, 0.0)), "/tf_static: base_link to mast: expected a finite transform"),
+    ):
+        path = made.write(tmp_path / f"{len(list(tmp_path.iterdir()))}.bag", "ros1")
+        with open_bag(path) as bag, pytest.raises(SkyfixError, match=message):
+            write_bag_folder(bag, tmp_path / "mine", BagRequest())
+        assert not (tmp_path / "mine").exists()
+
+
 def test_topics_are_named_when_there_is_a_choice_or_none(tmp_path: Path) -> None:
     made = MadeBag(scan_topics=("/left", "/right"), odometry_topics=("/odom", "/rear/odom"))
     with open_bag(made.write(tmp_path / "drive.bag", "ros1")) as bag:
