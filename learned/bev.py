@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -22,6 +23,8 @@ Float32Array = NDArray[np.float32]
 BANDS_M: tuple[tuple[float, float], ...] = ((-0.3, 0.3), (1.0, 2.0), (2.0, 3.5), (3.5, 12.0))
 """Height bands above the ground, metres: ground, body height, above cars, facades."""
 GROUND, BODY, HIGH, FACADE = range(len(BANDS_M))
+GroundModel = Literal["surface", "plane"]
+"""What heights are above: a ground estimated from the scan, which may slope, or the plane through the sensor's foot."""
 
 _GROUND_CELL_M = 1.0
 _GROUND_SLOPE = 0.15
@@ -30,10 +33,16 @@ _UNKNOWN_Z = np.float32(1e3)
 
 @dataclass(frozen=True, slots=True)
 class BevSettings:
-    """Extent and resolution of a bird's-eye view: a square of `size` pixels about the vehicle."""
+    """Extent and resolution of a bird's-eye view, a square of `size` pixels about the vehicle, and its ground."""
 
     half_extent_m: float = 40.0
     metres_per_pixel: float = 0.5
+    ground: GroundModel = "surface"
+
+    def __post_init__(self) -> None:
+        if self.ground not in get_args(GroundModel):
+            expected = " or ".join(get_args(GroundModel))
+            raise SkyfixError(f"bird's-eye view: expected a ground of {expected}, got {self.ground!r}")
 
     @property
     def size(self) -> int:
@@ -137,13 +146,15 @@ def bev_counts(points: NDArray[np.floating], ground_z: float, settings: BevSetti
     check_scan(points)
     if not math.isfinite(ground_z):
         raise SkyfixError(f"ground_z: expected a finite height in metres, got {ground_z}")
-    surface = ground_surface(points, ground_z, settings.half_extent_m)
-    ground_rows, ground_cols, on_surface = _cells(points, surface.shape[0], _GROUND_CELL_M)
-    near = points[on_surface]
-    height = near[:, 2] - surface[ground_rows, ground_cols]
+    height = points[:, 2] - ground_z
+    if settings.ground == "surface":
+        surface = ground_surface(points, ground_z, settings.half_extent_m)
+        ground_rows, ground_cols, on_surface = _cells(points, surface.shape[0], _GROUND_CELL_M)
+        points = points[on_surface]
+        height = points[:, 2] - surface[ground_rows, ground_cols]
     size = settings.size
     counts = np.zeros((len(BANDS_M), size * size), dtype=np.float32)
-    rows, cols, inside = _cells(near, size, settings.metres_per_pixel)
+    rows, cols, inside = _cells(points, size, settings.metres_per_pixel)
     cell, height = rows * size + cols, height[inside]
     for band, (low, high) in enumerate(BANDS_M):
         counts[band] = np.bincount(cell[(height >= low) & (height < high)], minlength=size * size)

@@ -32,8 +32,11 @@ def calibration_settings(config: TrainConfig) -> SimulationSettings:
 
 
 def evaluation_settings(config: TrainConfig, samples: int, half_extent_m: float) -> SimulationSettings:
-    """Samples to compare networks on, from searches of a half extent; calibration has not seen them."""
-    return _far(config, samples, half_extent_m, _EVALUATION_SEED_OFFSET)
+    """Samples to compare networks on, from searches of a half extent; calibration has not seen them.
+
+    Whatever worlds and sensors a network was trained in, these have drawn ones.
+    """
+    return replace(_far(config, samples, half_extent_m, _EVALUATION_SEED_OFFSET), world={}, sensor={})
 
 
 def _far(config: TrainConfig, samples: int, half_extent_m: float, seed_offset: int) -> SimulationSettings:

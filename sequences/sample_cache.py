@@ -66,9 +66,9 @@ def claim_cache(folder: Path, extracts: Sequence[tuple[MapFeatures, float]], set
         raise SkyfixError(f"cache {folder}: cannot be used: {error.strerror}") from error
     except ValueError as error:
         raise SkyfixError(f"cache {folder}: expected JSON in {_STAMP_FILE}, got {error}") from error
-    for key in stamp:
-        if found.get(key) != stamp[key]:
+    for key in stamp | found:
+        if found.get(key) != stamp.get(key):
             raise SkyfixError(
-                f"cache {folder}: its samples were made with {key} {found.get(key)}, these need {stamp[key]}; "
+                f"cache {folder}: its samples were made with {key} {found.get(key)}, these need {stamp.get(key)}; "
                 "choose another folder"
             )

@@ -61,6 +61,10 @@ class TrainConfig(BaseModel):
                 f"simulation.bev_half_extent_m: expected {bev.half_extent_m:g} as training.network.bev, "
                 f"got {self.simulation.bev_half_extent_m:g}"
             )
+        if bev.ground != self.simulation.ground:
+            raise SkyfixError(
+                f"simulation.ground: expected {bev.ground} as training.network.bev, got {self.simulation.ground}"
+            )
         if bev.metres_per_pixel != SAMPLE_METRES_PER_PIXEL:
             raise SkyfixError(
                 f"training.network.bev.metres_per_pixel: expected {SAMPLE_METRES_PER_PIXEL}, got {bev.metres_per_pixel}"

@@ -8,16 +8,17 @@ once.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
-from learned.bev import BevSettings, bev_counts
+from learned.bev import BevSettings, GroundModel, bev_counts
 from learned.samples import SAMPLE_METRES_PER_PIXEL, UNKNOWN_PLACE, Sample, cut_sample
 from sequences.lidar import LidarModel, simulate_scan
 from sequences.osm import MapFeatures
@@ -28,6 +29,8 @@ from sequences.world_style import WorldStyle
 
 _ATTEMPTS = 60
 _AREAS_MIXED = 16
+_NEWER = ("ground", "world", "sensor")
+"""Settings that older caches do not name: left out of a cache's stamp where they are as they were then."""
 _EXTRACTS_APART_M = 1e7
 """Every extract has a frame of its own; this puts places of different ones far apart."""
 
@@ -58,6 +61,16 @@ class SimulationSettings:
         Share of those whose map shows carriageways alone, with their full width.
     overgrown_share
         Share of neighbourhoods whose unpaved ground is mostly hedges and brushwood, which hide the houses.
+    ground
+        What the heights in the bird's-eye views are above, see `learned.bev`.
+    world, sensor
+        Properties that all neighbourhoods and all sensors have instead of what is drawn for each: of
+        `sequences.world_style.WorldStyle` and of `sequences.lidar.LidarModel`.
+
+    Raises
+    ------
+    SkyfixError
+        If a world or a sensor has no such property.
     """
 
     samples: int = 16000
@@ -72,6 +85,15 @@ class SimulationSettings:
     drivable_share: float = 0.0
     overgrown_share: float = 0.0
     seed: int = 0
+    ground: GroundModel = "surface"
+    world: Mapping[str, float] = field(default_factory=dict)
+    sensor: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, given, kind in (("world", self.world, WorldStyle), ("sensor", self.sensor, LidarModel)):
+            known = {each.name for each in fields(kind) if each.type == "float"}
+            for key in given.keys() - known:
+                raise SkyfixError(f"simulation.{name}: expected one of {', '.join(sorted(known))}, got {key}")
 
 
 class SimulatedSamples:
@@ -106,7 +128,8 @@ class SimulatedSamples:
         self._held: dict[int, list[Sample]] = {}
         how = asdict(settings)
         del how["samples"]
-        claim_cache(cache_dir, extracts, how)
+        unsaid = asdict(SimulationSettings())
+        claim_cache(cache_dir, extracts, {key: how[key] for key in how if key not in _NEWER or how[key] != unsaid[key]})
 
     def __len__(self) -> int:
         return self.settings.samples
@@ -182,6 +205,7 @@ class SimulatedSamples:
             style = WorldStyle.random(rng)
             if settings.overgrown_share > 0 and rng.random() < settings.overgrown_share:
                 style = replace(style, undergrowth=float(rng.uniform(0.4, 0.98)))
+            style = replace(style, **dict[str, Any](settings.world))
             world, map_raster = build_area(features, grid, style, rng)
             if settings.overhead_share > 0 and rng.random() < settings.overhead_share:
                 only_drivable = rng.random() < settings.drivable_share
@@ -193,6 +217,7 @@ class SimulatedSamples:
                 continue
             azimuths = int(rng.integers(settings.azimuths[0], settings.azimuths[1] + 1))
             model = LidarModel.random(rng, azimuths)
+            model = replace(model, **dict[str, Any](settings.sensor))
             model = replace(model, max_range_m=min(1.5 * settings.bev_half_extent_m, model.max_range_m))
             samples = [self._sample(pose, model, world, map_raster.classes, grid, rng) for pose in poses]
             places = [(float(pose[0]) + extract * _EXTRACTS_APART_M, float(pose[1])) for pose in poses]
@@ -210,7 +235,8 @@ class SimulatedSamples:
     ) -> Sample:
         scan = simulate_scan(world, pose, model, rng)
         row, col = grid.pixel_from_xy(pose[:2])
-        counts = bev_counts(scan, -model.mount_height_m, BevSettings(self.settings.bev_half_extent_m))
+        bev = BevSettings(self.settings.bev_half_extent_m, ground=self.settings.ground)
+        counts = bev_counts(scan, -model.mount_height_m, bev)
         return cut_sample(counts, classes, float(row), float(col), float(pose[2]), self.settings.sample_px)
 
 

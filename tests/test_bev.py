@@ -37,6 +37,20 @@ def test_a_slope_is_ground_and_not_a_wall(grade: float) -> None:
     assert counts[1:].sum() == 0
 
 
+def test_above_a_plane_a_slope_is_a_wall_and_flat_ground_is_ground() -> None:
+    plane = BevSettings(half_extent_m=20.0, ground="plane")
+    flat, slope = (bev_counts(ground_points(grade), -1.7, plane) for grade in (0.0, 0.1))
+    assert flat[GROUND].sum() == 60_000
+    assert flat[1:].sum() == 0
+    ahead = slope[:, :, 60:].sum(axis=(1, 2))  # from 10 m ahead, where the ground is 1 to 2 m above the foot
+    assert ahead[BODY] == ahead.sum() == pytest.approx(15_000, rel=0.05)
+
+
+def test_an_unknown_ground_is_refused() -> None:
+    with pytest.raises(SkyfixError, match="expected a ground of surface or plane, got 'mesh'"):
+        BevSettings(ground="mesh")  # type: ignore[arg-type]
+
+
 def test_the_ground_passes_under_a_building() -> None:
     """Roof returns 6 m up, with no ground seen beneath, lift the ground by no more than its largest slope."""
     points = ground_points()

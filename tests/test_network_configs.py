@@ -1,7 +1,10 @@
 """The configurations that come with the baselines: readable, of the network that they are named after, comparable."""
 
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -9,6 +12,7 @@ import learned
 from learned.architectures import ARCHITECTURES
 from sequences.ablation_config import read_ablation
 from sequences.train_config import read_config
+from sequences.world_style import WorldStyle
 
 FOLDER = Path(learned.__file__).parent
 CONFIGS = sorted((FOLDER / "configs").glob("*.yaml"))
@@ -72,6 +76,21 @@ def test_every_line_of_an_ablation_is_a_network_of_its_own(name: str) -> None:
         rest = variant.config.model_copy(update={"training": base.training})
         assert rest == base
         assert len(variant.changes) <= 5
+
+
+def test_the_ablation_of_the_simulation_takes_away_one_measure_a_line_and_all_in_the_last() -> None:
+    ablation = read_ablation(FOLDER / "configs" / "ablation_simulation.yaml")
+    base = read_config(ablation.base)
+    first, *single, last = (variant.changes for variant in ablation.variants)
+    assert first == {}
+    assert ablation.variants[0].config == base
+    together: dict[str, Any] = {}
+    for key, value in ((key, value) for changes in single for key, value in changes.items()):
+        together[key] = {**together.get(key, {}), **value} if isinstance(value, dict) else value
+    assert last == together
+    known = asdict(WorldStyle.random(np.random.default_rng(0)))
+    for key in last["simulation.world"]:
+        assert known[key] != 0.0, key
 
 
 def test_the_sensitivity_grid_is_the_papers() -> None:

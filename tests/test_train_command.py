@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,15 +12,20 @@ import torch
 from safetensors.torch import load_file
 
 import sequences.train_budget
+import sequences.training_data
 from fusion.errors import SkyfixError
 from learned.map_raster import CLASSES
 from learned.matcher import load_matcher
 from learned.training import NetworkChoice
+from sequences.held_out import calibration_settings, evaluation_settings
+from sequences.lidar import LidarModel, simulate_scan
 from sequences.osm import Line, MapFeatures, read_osm
 from sequences.train_budget import steps_within
 from sequences.train_command import TrainOptions, train_from_config
 from sequences.train_config import TrainConfig, read_config
 from sequences.training_data import SimulatedSamples, SimulationSettings
+from sequences.world import build_area
+from sequences.world_style import WorldStyle
 
 TINY = """
 extracts: {"pyrosm:test.osm.pbf": 1.0}
@@ -150,6 +156,45 @@ def test_samples_show_the_kind_of_map_asked_for(
         assert seen == {"void", "road"}
 
 
+def test_worlds_and_sensors_have_what_they_are_given(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two neighbourhoods, the rest of their style drawn as without."""
+    with resources.as_file(resources.files("pyrosm") / "data" / "test.osm.pbf") as path:
+        extracts = [(read_osm(path), 1.0)]
+    drawn = read_config(tiny).simulation
+    given = replace(drawn, world={"slope": 0.5, "tree_density": 0.0}, sensor={"mount_height_m": 1.23})
+    seen: list[tuple[WorldStyle, LidarModel]] = []
+    styles: list[WorldStyle] = []
+
+    def spy_area(features: Any, grid: Any, style: WorldStyle, rng: Any) -> Any:
+        styles.append(style)
+        return build_area(features, grid, style, rng)
+
+    def spy_scan(world: Any, pose: Any, model: LidarModel, rng: Any) -> Any:
+        seen.append((styles[-1], model))
+        return simulate_scan(world, pose, model, rng)
+
+    monkeypatch.setattr(sequences.training_data, "build_area", spy_area)
+    monkeypatch.setattr(sequences.training_data, "simulate_scan", spy_scan)
+    for how in (drawn, given):
+        for area in range(2):
+            SimulatedSamples(extracts, how, tmp_path / str(how is given)).area(area)
+    without, with_given = seen[:4], seen[4:]
+    assert {(style.slope, style.tree_density, model.mount_height_m) for style, model in with_given} == {
+        (0.5, 0.0, 1.23)
+    }
+    assert len({style.slope for style, _ in without}) == 2
+    for (style, _), (other, _) in zip(without, with_given, strict=True):
+        assert replace(style, slope=0.5, tree_density=0.0) == other
+
+
+def test_networks_of_other_worlds_are_compared_in_drawn_ones(tiny: Path) -> None:
+    config = read_config(tiny, ["simulation.world={slope: 0.0}", "simulation.sensor={tilt_noise_deg: 0.0}"])
+    assert calibration_settings(config).world == {"slope": 0.0}
+    assert evaluation_settings(config, 8, 20.0) == evaluation_settings(read_config(tiny), 8, 20.0)
+
+
 def test_overrides_are_typed_and_checked(tiny: Path) -> None:
     changed = read_config(tiny, ["training.steps=7", "training.network={architecture: rotmatch, channels: 6}"])
     assert changed.training.steps == 7
@@ -164,6 +209,9 @@ def test_overrides_are_typed_and_checked(tiny: Path) -> None:
         ("training.network.architecture=nothing", "expected one of .*rotmatch.*, got 'nothing'"),
         ("training.network.chanels=4", "rotmatch settings: chanels"),
         ("simulation.bev_half_extent_m=30", "expected 40 as training.network.bev, got 30"),
+        ("simulation.ground=plane", "expected surface as training.network.bev, got plane"),
+        ("simulation.world={slopes: 0.0}", r"simulation\.world: expected one of .*slope.*, got slopes"),
+        ("simulation.sensor={azimuths: 100}", r"simulation\.sensor: expected one of .*tilt_noise_deg.*, got azimuths"),
     ):
         with pytest.raises(SkyfixError, match=message) as caught:
             read_config(tiny, [override])
@@ -194,11 +242,15 @@ def test_a_cache_is_shared_by_runs_of_one_simulation_alone(tmp_path: Path) -> No
     wider = replace(roads, lines=(Line("road", np.array([[0.0, 0.0], [60.0, 0.0]])),))
     for extracts, how, message in (
         ([(roads, 1.0)], replace(settings, seed=3), "made with seed 0, these need 3; choose another folder"),
+        ([(roads, 1.0)], replace(settings, world={"slope": 0.0}), r"made with world None, these need {'slope': 0\.0}"),
         ([(roads, 2.0)], settings, "made with extracts"),
         ([(wider, 1.0)], settings, "made with extracts"),
     ):
         with pytest.raises(SkyfixError, match=message):
             SimulatedSamples(extracts, how, tmp_path / "cache")
+    SimulatedSamples([(roads, 1.0)], replace(settings, ground="plane"), tmp_path / "plane")
+    with pytest.raises(SkyfixError, match="made with ground plane, these need None"):
+        SimulatedSamples([(roads, 1.0)], settings, tmp_path / "plane")
     (tmp_path / "cache" / "made_with.json").unlink()
     (tmp_path / "cache" / "area_00000.npz").write_bytes(b"")
     with pytest.raises(SkyfixError, match=r"holds samples but no made_with\.json"):
