@@ -18,15 +18,18 @@ forgotten.
 R / P is read off what the last measurements did to the filter's covariance, averaged over directions, and scaled by
 the volume of the covariance since. So any filter and any likelihood will do, and no Gaussian is asked for.
 
+A smoother looks ahead as far as back, and more of its errors are shared: `smoothing_temperature`.
+
 Source: the covariance of a linear filter with a wrong gain, e.g. Gelb, "Applied Optimal Estimation", 1974, 7.2, with a
 first-order autoregression for the measurement errors.
 """
 
 from dataclasses import dataclass
-from math import exp, log
+from math import exp, log, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import brentq
 
 from fusion.arrays import FloatArray, checked
 from fusion.consistency import MAX_TEMPERATURE
@@ -108,6 +111,49 @@ class ErrorMemory:
             weight = _NEWEST * gain / (gain + _TELLING_GAIN)
             log_variance = self.log_variance + weight * (log_variance - self.log_variance)
         return ErrorMemory((1.0 - gain) * correlation * self.shared + gain, log_variance)
+
+
+def smoothing_temperature(correlation: float, temperature: float) -> float:
+    """By how much to flatten a measurement for a smoother, when a filter of the same odometry flattens it by so much.
+
+    In the steady state the weights of a filter's measurements fall off as a^n into the past, a smoother's as a^|n| to
+    both sides. It claims its true variance if
+
+        T_s = sum_nm a^|n| a^|m| rho^|n - m| / sum_n a^2|n| = (1 + b) / (1 - b) + 2 c b / (1 - b)^2
+
+    with b = a rho and c = (1 - a^2) / (1 + a^2), where a is that of its own gain: ``(1 - a)^2 / a`` is the drift over
+    T_s R, and a filter's (1 + b) / (1 - b) tells the drift over R. Between T and (1 + rho) / (1 - rho), or T itself
+    when that is more.
+
+    Parameters
+    ----------
+    correlation : float
+        rho in [0, 1] of the measurement's error with that of the last one.
+    temperature : float
+        What `ErrorMemory.temperature` says, at least 1.
+
+    Raises
+    ------
+    SkyfixError
+        When the correlation or the temperature is out of range.
+    """
+    if not 0.0 <= correlation <= 1.0:
+        raise SkyfixError(f"correlation: expected in [0, 1], got {correlation}")
+    if not temperature >= 1.0:
+        raise SkyfixError(f"temperature: expected at least 1, got {temperature}")
+    largest = (1.0 + correlation) / max(1.0 - correlation, 1.0 / MAX_TEMPERATURE)
+    if temperature == 1.0 or temperature >= largest:
+        return temperature
+    left = (temperature - 1.0) / (temperature + 1.0) / correlation
+    drift = temperature * (1.0 - left) ** 2 / left
+
+    def too_warm(candidate: float) -> float:
+        per_noise = drift / candidate
+        a = 1.0 - 0.5 * (sqrt(per_noise * (per_noise + 4.0)) - per_noise)
+        b, c = a * correlation, (1.0 - a * a) / (1.0 + a * a)
+        return candidate - (1.0 + b) / (1.0 - b) - 2.0 * c * b / (1.0 - b) ** 2
+
+    return float(brentq(too_warm, temperature, largest)) if too_warm(largest) > 0.0 else largest
 
 
 def _root(covariance: ArrayLike) -> FloatArray:

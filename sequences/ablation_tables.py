@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from fusion.errors import SkyfixError
 from sequences.ablation_config import Ablation
 from sequences.ablation_run import NETWORK, FinishedRun
 from sequences.evaluation_tables import PRIOR, start_label
+from sequences.over_seeds import cell, markdown_table, mean_and_std, numbers, over_seeds, write_content
 
 _COLUMNS: dict[str, tuple[str, float]] = {
     "mean m": ("position_error_m.mean", 1),
@@ -38,16 +35,7 @@ _GRID_KEY, _GRID_TITLE = "position_error_m.mean", "mean position error, m"
 def write_tables(out_dir: Path, ablation: Ablation, finished: Sequence[FinishedRun], planned: int) -> None:
     """Write ablation.json and ablation.md, of as many runs as there are; SkyfixError if that fails."""
     content = summary(ablation, finished, planned)
-    for name, text in (
-        ("ablation.json", json.dumps(content, indent=1, allow_nan=False) + "\n"),
-        ("ablation.md", markdown(content)),
-    ):
-        partial = out_dir / f"{name}.part"
-        try:
-            partial.write_text(text, encoding="utf-8")
-            partial.replace(out_dir / name)
-        except OSError as error:
-            raise SkyfixError(f"{out_dir / name}: cannot be written: {error.strerror}") from error
+    write_content(out_dir, "ablation", content, markdown(content))
 
 
 def summary(ablation: Ablation, finished: Sequence[FinishedRun], planned: int) -> dict[str, Any]:
@@ -78,7 +66,7 @@ def summary(ablation: Ablation, finished: Sequence[FinishedRun], planned: int) -
     for number, first in enumerate(finished[0].evaluations):
         told = {key: value for key, value in first.items() if key != "methods"}
         rows = {
-            name: _over_seeds([run.evaluations[number]["methods"][NETWORK] for run in runs])
+            name: over_seeds([run.evaluations[number]["methods"][NETWORK] for run in runs])
             for name, runs in by_variant.items()
         }
         tables.append({**told, "prior": first["methods"][PRIOR], "variants": rows})
@@ -91,12 +79,6 @@ def summary(ablation: Ablation, finished: Sequence[FinishedRun], planned: int) -
         "variants": variants,
         "tables": tables,
     }
-
-
-def mean_and_std(values: Sequence[float]) -> dict[str, float | None]:
-    """Mean, and standard deviation of the sample (n - 1), which a single value has none of."""
-    spread = float(np.std(values, ddof=1)) if len(values) > 1 else None
-    return {"mean": round(float(np.mean(values)), 6), "std": None if spread is None else round(spread, 6)}
 
 
 def markdown(content: Mapping[str, Any]) -> str:
@@ -118,39 +100,23 @@ def markdown(content: Mapping[str, Any]) -> str:
     return "\n".join(parts)
 
 
-def _over_seeds(summaries: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float | None]]:
-    flat = [_numbers(each) for each in summaries]
-    return {key: mean_and_std([each[key] for each in flat]) for key in flat[0]}
-
-
-def _numbers(content: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
-    """Every number of a summary by its dotted key."""
-    flat: dict[str, float] = {}
-    for key, value in content.items():
-        if isinstance(value, Mapping):
-            flat |= _numbers(value, f"{prefix}{key}.")
-        elif isinstance(value, (int, float)):
-            flat[f"{prefix}{key}"] = value
-    return flat
-
-
 def _variants_table(variants: Mapping[str, Any]) -> str:
     rows = []
     for name, facts in variants.items():
         changes = ", ".join(f"`{key}: {value}`" for key, value in facts["changes"].items()) or "-"
         seeds = ", ".join(str(seed) for seed in facts["seeds"])
         size = f"{facts['parameters'] / 1e6:.2f} M"
-        rows.append([name, changes, size, str(facts["steps"]), _cell(facts["cpu_minutes"], 1, 1), seeds])
-    return _table(["variant", "changes", "parameters", "steps", "CPU minutes a run", "seeds"], rows, left=2)
+        rows.append([name, changes, size, str(facts["steps"]), cell(facts["cpu_minutes"], 1, 1), seeds])
+    return markdown_table(["variant", "changes", "parameters", "steps", "CPU minutes a run", "seeds"], rows, left=2)
 
 
 def _scores_table(table: Mapping[str, Any]) -> str:
-    prior = {key: {"mean": value, "std": None} for key, value in _numbers(table["prior"]).items()}
+    prior = {key: {"mean": value, "std": None} for key, value in numbers(table["prior"]).items()}
     rows = [
-        [name, *(_cell(scores.get(key), unit) for key, unit in _COLUMNS.values())]
+        [name, *(cell(scores.get(key), unit) for key, unit in _COLUMNS.values())]
         for name, scores in {PRIOR: prior, **table["variants"]}.items()
     ]
-    return _table(["variant", *_COLUMNS], rows, left=1)
+    return markdown_table(["variant", *_COLUMNS], rows, left=1)
 
 
 def _grid_table(
@@ -160,22 +126,7 @@ def _grid_table(
     (down, across), (down_values, across_values) = grid, grid.values()
     at = {tuple(facts["point"]): scores[name] for name, facts in variants.items() if facts["point"] is not None}
     rows = [
-        [f"{left}", *(_cell(at.get((left, top), {}).get(_GRID_KEY), 1) for top in across_values)]
-        for left in down_values
+        [f"{left}", *(cell(at.get((left, top), {}).get(_GRID_KEY), 1) for top in across_values)] for left in down_values
     ]
     corner = f"{down.rpartition('.')[2]} \\ {across.rpartition('.')[2]}"
-    return f"{_GRID_TITLE}:\n\n" + _table([corner, *map(str, across_values)], rows, left=1)
-
-
-def _cell(value: Mapping[str, float | None] | None, unit: float, digits: int | None = None) -> str:
-    """`mean ± std` in a unit; shares without decimals; a dash where there is no number."""
-    if value is None or value["mean"] is None:
-        return "-"
-    digits = digits if digits is not None else (0 if unit == 100 else 2)
-    text = f"{unit * value['mean']:.{digits}f}"
-    return text if value["std"] is None else f"{text} ± {unit * value['std']:.{digits}f}"
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-    rule = "|" + "---|" * left + "---:|" * (len(header) - left)
-    return "\n".join(["| " + " | ".join(header) + " |", rule, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
+    return f"{_GRID_TITLE}:\n\n" + markdown_table([corner, *map(str, across_values)], rows, left=1)

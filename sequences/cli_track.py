@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -134,8 +133,7 @@ def track(
         map_check_every_m=watch_map_every,
         calibration=None if calibration is None else read_calibration(calibration),
     )
-    groups = changed({name: getattr(settings, name) for name in GROUPS}, override or ())
-    _run(opened, matcher, replace(settings, **groups), out, overwrite, quiet, backend)
+    _run(opened, matcher, changed(settings, override or (), GROUPS), out, overwrite, quiet, backend)
 
 
 def view(run: Annotated[Path, typer.Argument(help="Run directory.", metavar="RUN")]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -34,35 +34,38 @@ def dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def changed(groups: Mapping[str, Settings], overrides: Iterable[str]) -> dict[str, Settings]:
-    """Groups of settings with some of their values replaced.
+def changed(settings: Settings, overrides: Iterable[str], names: Collection[str]) -> Settings:
+    """Settings with some of their values replaced.
 
     Parameters
     ----------
-    groups
-        Name -> frozen dataclass, which checks itself.
+    settings
+        A frozen dataclass, which checks itself.
     overrides
-        "GROUP.KEY=VALUE" each. A KEY may itself hold settings: "GROUP.KEY.KEY=VALUE", where what was None so far
-        begins with its defaults, or "GROUP.KEY={...}" for several at once, the others at their defaults.
+        "KEY=VALUE" or "GROUP.KEY=VALUE" each. A KEY may itself hold settings: "GROUP.KEY.KEY=VALUE", where what was
+        None so far begins with its defaults, or "GROUP.KEY={...}" for several at once, the others at their defaults.
+    names
+        Fields of the settings that may be changed, or whose fields may.
 
     Raises
     ------
     SkyfixError
         If a key is unknown, or a value has the wrong type or is out of range.
     """
-    content = dict(groups)
+    groups = {name for name in names if is_dataclass(getattr(settings, name))}
     for override in overrides:
-        (name, *keys), value = split_override(override)
+        keys, value = split_override(override)
         shown = f"--set {override}"
-        if name not in content or not keys:
-            raise SkyfixError(f"{shown}: expected one of {', '.join(f'{group}.KEY=VALUE' for group in content)}")
+        if keys[0] not in names or (keys[0] in groups and len(keys) == 1):
+            expected = (f"{name}.KEY=VALUE" if name in groups else f"{name}=VALUE" for name in names)
+            raise SkyfixError(f"{shown}: expected one of {', '.join(expected)}")
         try:
-            content[name] = _replaced(content[name], keys, value)
+            settings = _replaced(settings, keys, value)
         except ValidationError as error:
             raise SkyfixError(f"{shown}: {error.errors()[0]['msg']}") from error
         except SkyfixError as error:
             raise SkyfixError(f"{shown}: {error}") from error
-    return content
+    return settings
 
 
 def _replaced(settings: Any, keys: list[str], value: Any) -> Any:

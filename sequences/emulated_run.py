@@ -20,7 +20,7 @@ from fusion.arrays import FloatArray, IntArray
 from fusion.consistency import error_correlation
 from fusion.emulation.error_profile import TRANSLOCNET_KITTI, ErrorProfile
 from fusion.emulation.likelihood_emulator import EmulatorSettings, LikelihoodEmulator
-from fusion.error_memory import ErrorMemory
+from fusion.error_memory import ErrorMemory, smoothing_temperature
 from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.factor_graph import OdometryDrift, SmootherSettings
@@ -201,7 +201,8 @@ def run_emulated(truth: Trajectory, odometry: Trajectory, settings: EmulatedRunS
             report = particles.update(likelihood, temperature)
             memory = memory.after(correlation, temperature, before, particles.estimate(stamp).covariance)
             history.record(particles, stamp, report)
-            mixtures.append(likelihood.modes(len(likelihood.weights)).tempered(temperature))
+            flattening = smoothing_temperature(correlation, temperature)
+            mixtures.append(likelihood.modes(len(likelihood.weights)).tempered(flattening))
             answers[frame], since_m = likelihood.answer, 0.0
         else:
             mixtures.append(None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ SETTINGS = TrackSettings("wheels", seed=3, particles=3000)
 
 
 def with_choices(settings: TrackSettings, *overrides: str) -> TrackSettings:
-    return replace(settings, **changed({name: getattr(settings, name) for name in GROUPS}, overrides))
+    return changed(settings, overrides, GROUPS)
 
 
 def run(made: MadeDrive, *overrides: str) -> RunResult:
