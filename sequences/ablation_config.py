@@ -15,7 +15,6 @@ Keys are dotted paths into the base, as with `skyfix train --set`.
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from fusion.errors import SkyfixError
+from sequences.dotted_keys import as_overrides
 from sequences.train_config import TrainConfig, read_config
 
 
@@ -64,7 +64,7 @@ class Variant:
     @property
     def overrides(self) -> tuple[str, ...]:
         """The changes as `sequences.train_config.read_config` takes them."""
-        return _as_overrides(self.changes)
+        return as_overrides(self.changes)
 
     @property
     def folder(self) -> str:
@@ -157,17 +157,9 @@ def _variant(
     try:
         if "training.seed" in changes:
             raise SkyfixError("training.seed: expected to be left to --seeds, got a value")
-        return Variant(name, changes, read_config(base, (*overrides, *_as_overrides(changes))), point)
+        return Variant(name, changes, read_config(base, (*overrides, *as_overrides(changes))), point)
     except SkyfixError as error:
         raise SkyfixError(f"ablation {path.name}: variant {name!r}: {error}") from error
-
-
-def _as_overrides(changes: Mapping[str, Any]) -> tuple[str, ...]:
-    # In a list, because YAML ends a bare value with a line of dots.
-    return tuple(
-        f"{key}={yaml.safe_dump([value], default_flow_style=True, width=math.inf).strip()[1:-1]}"
-        for key, value in changes.items()
-    )
 
 
 def _point_name(grid: Mapping[str, Sequence[Any]], point: tuple[Any, ...]) -> str:

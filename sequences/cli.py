@@ -21,6 +21,7 @@ from sequences.cli_evaluate import evaluate
 from sequences.cli_map import draw_map
 from sequences.cli_options import JsonOption, PickleOption, SeedOption, write_json
 from sequences.cli_retrieve import retrieve
+from sequences.cli_sweep import sweep
 from sequences.cli_track import demo, track, view
 from sequences.cli_train import export, train
 
@@ -43,6 +44,12 @@ app.command(
     "`skyfix track drives/mine --set filter.adaptive.most=50000 --set noise.lateral_m_per_sqrt_m=0.02`"
 )(track)
 app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")(view)
+app.command(
+    epilog="Examples:\n\n"
+    "`skyfix sweep drives/monday drives/tuesday --odometry wheels --odometry kiss_icp --seeds 0,1,2`\n\n"
+    "`skyfix sweep drives/mine --set particles=[500,2000,10000] --set measure_every_m=[2,4,8] --jobs 4`\n\n"
+    "`skyfix sweep demo --matcher rotmatch --matcher runs/mine/hybrid.safetensors --out runs/networks`"
+)(sweep)
 app.command(
     epilog="Examples:\n\n"
     "`skyfix evaluate demo drives/kitti_360 --matcher geometric --json shots.json`\n\n"

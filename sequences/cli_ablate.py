@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
-from fusion.errors import SkyfixError
 from sequences.cli_options import (
     CacheOption,
     ExtractsOption,
     HalfExtentOption,
     HalfHeadingsOption,
     MaxFramesOption,
+    seed_numbers,
     training_line,
 )
 
@@ -64,14 +64,13 @@ def ablate(
 
     opened = [open_sequence(path) for path in evaluate or []]
     options = AblateOptions(
-        _numbers(seeds), minutes, cache, tuple(override or ()), half_extent, tuple(half_heading_deg or ()), max_frames
+        seed_numbers(seeds),
+        minutes,
+        cache,
+        tuple(override or ()),
+        half_extent,
+        tuple(half_heading_deg or ()),
+        max_frames,
     )
     table = run_ablation(config, data, out, opened, options, training_line, lambda line: print(line, file=sys.stderr))
     typer.echo(table.read_text(encoding="utf-8"), nl=False)
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError as error:
-        raise SkyfixError(f"--seeds: expected whole numbers between commas, got {text!r}") from error

@@ -82,6 +82,14 @@ PickleOption = Annotated[
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the numbers to this file.", metavar="FILE")]
 
 
+def seed_numbers(text: str) -> tuple[int, ...]:
+    """The seeds that an option lists; `SkyfixError` if they are not whole numbers between commas."""
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError as error:
+        raise SkyfixError(f"--seeds: expected whole numbers between commas, got {text!r}") from error
+
+
 def training_line(step: int, steps: int, loss: float, validation: float | None) -> None:
     """Show a training step on standard error, now and then."""
     if step % 50 == 0 or step == steps:

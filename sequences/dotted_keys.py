@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, get_args, get_type_hints
@@ -24,6 +25,15 @@ def split_override(override: str) -> tuple[list[str], Any]:
         return keys, yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise SkyfixError(f"--set {path}: expected a YAML value, got {text!r}") from error
+
+
+def as_overrides(changes: Mapping[str, Any]) -> tuple[str, ...]:
+    """ "KEY.KEY=VALUE" of dotted keys and values, such that `split_override` gives them back."""
+    # In a list, because YAML ends a bare value with a line of dots.
+    return tuple(
+        f"{key}={yaml.safe_dump([value], default_flow_style=True, width=math.inf).strip()[1:-1]}"
+        for key, value in changes.items()
+    )
 
 
 def dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,9 +1,12 @@
 """The run directory: everything a tracked drive leaves on disk, written as a whole or not at all.
 
-    config.yaml      what was run, every setting resolved metrics.json     see `run_metrics` report.html      see
-    `report` filter.tum  smoother.tum  odometry.tum  single_shot.tum     poses in the map frame, see `trajectory_io`
-    frames.csv       a line per frame: errors, covariance, effective sample size, evidence, lost score, milliseconds a
-    stage log.txt          what happened on the way
+    config.yaml     what was run, every setting resolved
+    metrics.json    see `run_metrics`
+    report.html     see `report`
+    filter.tum  smoother.tum  odometry.tum  single_shot.tum    poses in the map frame, see `trajectory_io`
+    frames.csv      a line per frame: errors, covariance, effective sample size, evidence, lost score, milliseconds a
+                    stage
+    log.txt         what happened on the way
 
 Files go to a hidden folder beside the target, which is renamed when all of them are there.
 """
@@ -14,12 +17,10 @@ import csv
 import json
 import shutil
 import tempfile
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
@@ -27,7 +28,7 @@ from sequences.filter_pass import STAGES
 from sequences.geojson import write_geojson
 from sequences.metrics import position_errors, vehicle_frame_errors
 from sequences.report import write_report
-from sequences.run_files import CONFIG_FILE, METRICS_FILE, check_target
+from sequences.run_files import CONFIG_FILE, METRICS_FILE, check_target, config_text
 from sequences.run_result import FrameRow, RunResult
 from sequences.trajectory_io import format_seconds, write_tum
 
@@ -85,7 +86,8 @@ def _put_in_place(draft: Path, out_dir: Path) -> None:
 
 
 def _write_files(result: RunResult, out_dir: Path) -> None:
-    (out_dir / CONFIG_FILE).write_text(_config(result), encoding="utf-8")
+    config = config_text(result.sequence_name, result.matcher_name, result.settings)
+    (out_dir / CONFIG_FILE).write_text(config, encoding="utf-8")
     metrics = json.dumps(result.metrics, indent=1, allow_nan=False)
     (out_dir / METRICS_FILE).write_text(metrics + "\n", encoding="utf-8")
     for name in ("filter", "smoother", "odometry", "single_shot"):
@@ -95,14 +97,6 @@ def _write_files(result: RunResult, out_dir: Path) -> None:
     _write_frames(result, out_dir / "frames.csv")
     (out_dir / "log.txt").write_text("".join(f"{line}\n" for line in result.log), encoding="utf-8")
     write_report(result, out_dir)
-
-
-def _config(result: RunResult) -> str:
-    settings = asdict(result.settings)
-    if settings["start"] is not None:
-        settings["start"] = list(settings["start"])
-    content = {"sequence": result.sequence_name, "matcher": result.matcher_name, **settings}
-    return yaml.safe_dump(content, sort_keys=False)
 
 
 def _write_frames(result: RunResult, path: Path) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from fusion.errors import SkyfixError
 from fusion.odometry_errors import OdometryCalibration
+from sequences.track_settings import TrackSettings
 
 METRICS_FILE = "metrics.json"
 CONFIG_FILE = "config.yaml"
@@ -44,6 +47,14 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise SkyfixError(f"{run_dir / METRICS_FILE}: cannot be read: {error}") from error
     return metrics
+
+
+def config_text(sequence_name: str, matcher_name: str, settings: TrackSettings) -> str:
+    """The content of a run's `config.yaml`."""
+    content = asdict(settings)
+    if content["start"] is not None:
+        content["start"] = list(content["start"])
+    return yaml.safe_dump({"sequence": sequence_name, "matcher": matcher_name, **content}, sort_keys=False)
 
 
 def read_calibration(run_dir: Path) -> OdometryCalibration:
