@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sequences.emulated_run
 from fusion import (
     ORIENTERNET_KITTI_SEQUENTIAL,
     EmulatorSettings,
@@ -46,6 +47,23 @@ def test_fusing_emulated_measurements_beats_them_and_the_odometry() -> None:
     assert run.table().startswith("emulated TransLocNet")
     again = run_emulated(truth, emulate_odometry(truth, 1), settings)
     np.testing.assert_array_equal(again.smoother.poses, run.smoother.poses)
+
+
+def test_errors_that_repeat_flatten_what_the_graph_gets_more_than_what_the_filter_gets(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    truth = winding_drive(300)
+    settings = EmulatedRunSettings(
+        emulator=EmulatorSettings(step_correlation=0.9), particles=600, kept_particles=600, smoother=QUICK
+    )
+    run = run_emulated(truth, emulate_odometry(truth, 1), settings)
+    monkeypatch.setattr(sequences.emulated_run, "smoothing_temperature", lambda correlation, temperature: temperature)
+    as_filter = run_emulated(truth, emulate_odometry(truth, 1), settings)
+    np.testing.assert_array_equal(run.filter.covariances, as_filter.filter.covariances)
+    claimed, proud = (one.graph.covariances for one in (run, as_filter))
+    assert claimed is not None
+    assert proud is not None
+    assert np.median(np.linalg.det(claimed) / np.linalg.det(proud)) > 1.5
 
 
 def test_settings_reach_the_run() -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fusion import EmulatorSettings, LikelihoodEmulator, OdometryIncrement, ParticleFilter, SkyfixError, se2
 from fusion.consistency import correlated_error_temperature, error_correlation, nees
 from fusion.emulation.error_profile import ErrorProfile
-from fusion.error_memory import ErrorMemory
+from fusion.error_memory import ErrorMemory, smoothing_temperature
 
 
 def claims(drift, variance, distances, length, temperature_of):
@@ -48,6 +50,51 @@ def test_a_linear_filter_claims_its_true_variance(drift, variance, irregular):
     assert true < its_true
     proud, _ = claims(drift, variance, distances, length, lambda memory, rho, claimed: 1.0)
     assert proud[50:].mean() > 1.5
+
+
+def smoother_ratio(drift, variance, distances, length, smoothing):
+    """True over claimed variance of the batch smoother of a scalar random walk, away from the ends."""
+    claimed, memory, temperatures = 100.0, ErrorMemory(), []
+    for step, distance in enumerate(distances):
+        claimed += drift * distance
+        rho = error_correlation(distance, length) if step else 0.0
+        temperature = memory.temperature(rho, [[claimed]])
+        gain = claimed / (claimed + temperature * variance)
+        memory = memory.after(rho, temperature, [[claimed]], [[(1 - gain) * claimed]])
+        claimed *= 1 - gain
+        temperatures.append(smoothing(rho, temperature))
+    steps = np.diff(np.eye(len(distances)), axis=0) / np.sqrt(drift * distances[1:, None])
+    information = steps.T @ steps
+    information[0, 0] += 1.0 / (100.0 + drift * distances[0])
+    weights = np.diag(1.0 / (np.array(temperatures) * variance))
+    covariance = np.linalg.inv(information + weights)
+    way = np.cumsum(distances)
+    errors = variance * np.exp(-np.abs(way[:, None] - way) / length)
+    gains = covariance @ weights
+    true = covariance @ information @ covariance + gains @ errors @ gains.T
+    return (np.diag(true) / np.diag(covariance))[40:-40]
+
+
+@pytest.mark.parametrize("irregular", [False, True])
+@pytest.mark.parametrize(("drift", "variance"), [(0.01, 4.0), (0.03, 1.0), (0.3, 1.0), (1.0, 1.0)])
+def test_a_linear_smoother_claims_its_true_variance(drift, variance, irregular):
+    """Correlation 0.9 a step: within 0.5 % at regular steps, 9 % at others; by a filter's temperatures it claims too
+    little, most where it forgets soonest."""
+    distances = np.random.default_rng(0).uniform(0.1, 1.9, 200) if irregular else np.ones(200)
+    length = -1.0 / np.log(0.9)
+    ratios = smoother_ratio(drift, variance, distances, length, smoothing_temperature)
+    assert abs(ratios.mean() - 1.0) < (0.09 if irregular else 0.005)
+    by_filter = smoother_ratio(drift, variance, distances, length, lambda rho, temperature: temperature)
+    assert by_filter.mean() > (1.3 if drift >= 0.3 else 1.04)
+
+
+@given(rho=st.floats(0.0, 1.0), temperature=st.floats(1.0, 1000.0))
+def test_a_smoother_flattens_more_than_a_filter_and_less_than_one_that_forgets_nothing(rho, temperature):
+    largest = (1 + rho) / max(1 - rho, 1e-3)
+    found = smoothing_temperature(rho, temperature)
+    assert temperature <= found <= max(temperature, largest)
+    assert smoothing_temperature(0.0, temperature) == temperature
+    assert smoothing_temperature(rho, 1.0) == 1.0
 
 
 def test_a_filter_of_small_gain_comes_to_the_well_known_temperature():
@@ -115,6 +162,8 @@ def test_bad_input_is_one_line():
         "covariance before: expected square and positive definite": lambda: memory.temperature(0.5, -np.eye(3)),
         "covariance after: expected": lambda: memory.after(0.5, 1.0, np.eye(3), np.eye(2)),
         "temperature: expected > 0": lambda: memory.after(0.5, 0.0, np.eye(3), np.eye(3)),
+        "correlation: expected in .0, 1., got nan": lambda: smoothing_temperature(np.nan, 2.0),
+        "temperature: expected at least 1, got 0.5": lambda: smoothing_temperature(0.5, 0.5),
         "distance_m: expected >= 0": lambda: error_correlation(-1.0, 2.0),
         "correlation_length_m: expected >= 0": lambda: error_correlation(1.0, np.nan),
     }.items():
