@@ -1,10 +1,12 @@
 """The folder format: the sequence on disk that every reader can be converted to, and that `skyfix track DIR` opens.
 
-    DIR/map.json, DIR/*.png     see `map_source` DIR/ground_truth.tum        optional; map frame; may be denser than
-    the scans DIR/odometry/NAME.tum       drifting trajectories in a frame of their own DIR/scans/NNNNNN.bin
-    float32 (x, y, z, reflectance), KITTI velodyne layout; NNNNNN counts the lines of times.txt DIR/scans/times.txt
-    seconds, one a scan DIR/sensor.json             ground_z, the height of the ground in the scan frame (metres);
-    scans_simulated: true
+    DIR/map.json, DIR/*.png     see `map_source`
+    DIR/ground_truth.tum        optional; map frame; may be denser than the scans
+    DIR/odometry/NAME.tum       drifting trajectories in a frame of their own
+    DIR/scans/NNNNNN.bin        float32 (x, y, z, reflectance), KITTI velodyne layout; or all of them .npy, .pcd or
+                                .ply, see `point_file`; NNNNNN counts the lines of times.txt
+    DIR/scans/times.txt         seconds, one a scan
+    DIR/sensor.json             ground_z, the height of the ground in the scan frame (metres); scans_simulated: true
                                 where the scans in the folder were ray-cast (absent: they were measured)
 
 Without `scans/` they are ray-cast from the map at the ground-truth poses, one a pose, and `scans_simulated` says so. A
@@ -26,7 +28,7 @@ from learned.map_raster import MapRaster
 from sequences.lidar import LidarModel, simulate_scan
 from sequences.map_source import read_json, read_map, read_number, read_origin, write_map
 from sequences.odometry_files import OdometryFiles
-from sequences.point_file import read_points
+from sequences.point_file import READERS, read_points
 from sequences.sequence import ScanError, Sequence, origin_of
 from sequences.trajectory_io import format_seconds, read_times, read_tum, write_tum
 from sequences.world_model import World
@@ -65,6 +67,7 @@ class FolderSequence:
         self._lidar = LidarModel()
         self._has_scans = (self._path / "scans").is_dir()
         if self._has_scans:
+            self._suffix = self._scan_suffix()
             sensor = read_json(self._path / "sensor.json")
             self.stamps_ns = self._recorded_stamps()
             self.ground_z = read_number(sensor, "ground_z", "sensor.json")
@@ -90,12 +93,20 @@ class FolderSequence:
         """Read the named odometry; `SkyfixError` listing the names there are when it is unknown."""
         return self._odometry.read(name)
 
+    def _scan_suffix(self) -> str:
+        """What the scans' files end in."""
+        scans = self._path / "scans"
+        found = [suffix for suffix in READERS if next(scans.glob(f"*{suffix}"), None) is not None]
+        if len(found) > 1:
+            raise SkyfixError(f"scans: expected files of one format, got {' and '.join(found)}")
+        return found[0] if found else next(iter(READERS))
+
     def _scan_file(self, index: int) -> Path:
-        return self._path / "scans" / f"{index:06d}.bin"
+        return self._path / "scans" / f"{index:06d}{self._suffix}"
 
     def _recorded_stamps(self) -> NDArray[np.int64]:
         stamps = read_times(self._path / "scans" / "times.txt")
-        found = sum(1 for _ in (self._path / "scans").glob("*.bin"))
+        found = sum(1 for _ in (self._path / "scans").glob(f"*{self._suffix}"))
         missing = [index for index in range(len(stamps)) if not self._scan_file(index).exists()]
         if missing:
             raise SkyfixError(

@@ -1,8 +1,7 @@
 """Scans in ROS messages: `sensor_msgs/PointCloud2`, of ROS 1 and 2.
 
 The message describes its own layout: named fields at offsets of a point's bytes, rows that may be padded, either byte
-order. Points that are not finite (an organised cloud's missing returns) are left out. The reflectance is `intensity`
-or `reflectivity`, in 0..1 or, where a scan has larger ones, in 0..255 and divided by that; without a field it is 0.
+order. Points that are not finite (an organised cloud's missing returns) are left out.
 
 Source: https://docs.ros.org/en/rolling/p/sensor_msgs/msg/PointCloud2.html
 """
@@ -14,10 +13,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sequences.sequence import SCAN_COLUMNS, ScanError
+from sequences.point_file import REFLECTANCE, scan_of
+from sequences.sequence import ScanError
 
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_REFLECTANCE = ("intensity", "reflectivity")
 
 
 class PointField(Protocol):
@@ -53,7 +52,7 @@ def points_of_message(message: PointCloud2, label: str) -> NDArray[np.float32]:
     missing = [name for name in "xyz" if name not in fields]
     if missing:
         raise ScanError(f"{label}: expected fields x, y, z, got {', '.join(fields) or 'none'}")
-    reflectance = [name for name in _REFLECTANCE if name in fields][:1]
+    reflectance = [name for name in REFLECTANCE if name in fields][:1]
     names = ["x", "y", "z", *reflectance]
     kinds = [order + _KINDS.get(fields[name].datatype, "?") for name in names]
     ends = [
@@ -75,13 +74,4 @@ def points_of_message(message: PointCloud2, label: str) -> NDArray[np.float32]:
         }
     )
     cells = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(layout).reshape(-1)
-    points = np.zeros((len(cells), SCAN_COLUMNS), np.float32)
-    for column, name in enumerate(names):
-        points[:, column] = cells[name]
-    points = points[np.isfinite(points[:, :3]).all(axis=1)]
-    if len(points) == 0:
-        raise ScanError(f"{label}: expected points, got none that is finite")
-    points[:, 3] = np.nan_to_num(points[:, 3], nan=0.0, posinf=0.0, neginf=0.0)
-    if points[:, 3].max() > 1.0:
-        points[:, 3] = np.clip(points[:, 3] / 255.0, 0.0, 1.0)
-    return points
+    return scan_of({name: cells[name] for name in names}, label)

@@ -1,4 +1,4 @@
-"""What the README shows works: its Python runs as it stands, its commands and files exist."""
+"""What the README and the pages of docs show works: the Python runs as it stands, commands and files exist."""
 
 from __future__ import annotations
 
@@ -14,11 +14,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = {page: page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")))}
 
 
 def blocks(language: str) -> list[str]:
     """The README's fenced blocks in one language, in order."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
+    return blocks_of(README, language)
+
+
+def blocks_of(page: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", page, flags=re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +55,12 @@ def test_a_network_that_knows_nothing_is_uniform(namespace: dict[str, Any]) -> N
 
 
 def named_commands() -> dict[str, set[str]]:
-    """Subcommands that the README (shell blocks, inline) and the Makefile name, with the options shown for each."""
+    """Subcommands that the pages (shell blocks, inline) and the Makefile name, with the options shown for each."""
     makefile = re.findall(r"\$\(BIN\)/(skyfix .*)", (ROOT / "Makefile").read_text(encoding="utf-8"))
-    texts = [*blocks("sh"), *re.findall(r"`([^`\n]+)`", README), *makefile]
+    texts = list(makefile)
+    for page in PAGES.values():
+        texts += [block.replace("\\\n", " ") for block in blocks_of(page, "sh")]
+        texts += [inline.replace("\n", " ") for inline in re.findall(r"(?<!`)`([^`]+)`(?!`)", page)]
     found: dict[str, set[str]] = {}
     for command, rest in re.findall(r"\bskyfix ([a-z]+)([^#\n]*)", "\n".join(texts)):
         found.setdefault(command, set()).update(re.findall(r"--[a-z-]+", rest))
@@ -86,6 +94,8 @@ def test_make_targets_exist() -> None:
 
 
 def test_pictures_and_files_exist() -> None:
-    linked = re.findall(r"\]\((?!https?://|#)([^)]+)\)", README)
-    for name in [*linked, "LICENSE", "CHANGELOG.md", "constraints.txt"]:
+    for page, text in PAGES.items():
+        for name in re.findall(r"\]\((?!https?://|#)([^)]+)\)", text):
+            assert (page.parent / name).is_file(), f"{page.name}: {name}"
+    for name in ("LICENSE", "CHANGELOG.md", "constraints.txt"):
         assert (ROOT / name).is_file(), name
