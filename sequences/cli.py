@@ -47,7 +47,7 @@ app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")(view)
 app.command(
     epilog="Examples:\n\n"
     "`skyfix sweep drives/monday drives/tuesday --odometry wheels --odometry kiss_icp --seeds 0,1,2`\n\n"
-    "`skyfix sweep drives/mine --set particles=[500,2000,10000] --set measure_every_m=[2,4,8] --jobs 4`\n\n"
+    "`skyfix sweep drives/mine --set 'particles=[500,2000,10000]' --set 'measure_every_m=[2,4,8]' --jobs 4`\n\n"
     "`skyfix sweep demo --matcher rotmatch --matcher runs/mine/hybrid.safetensors --out runs/networks`"
 )(sweep)
 app.command(
