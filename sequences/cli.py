@@ -20,7 +20,7 @@ from sequences.cli_emulate import emulate
 from sequences.cli_evaluate import evaluate
 from sequences.cli_map import draw_map
 from sequences.cli_options import JsonOption, PickleOption, SeedOption, write_json
-from sequences.cli_retrieve import retrieve
+from sequences.cli_retrieve import retrieve, train_places
 from sequences.cli_sweep import sweep
 from sequences.cli_track import demo, track, view
 from sequences.cli_train import export, train
@@ -79,9 +79,16 @@ app.command(
     "`skyfix emulate drives/kitti_00 --odometry sptam --measure-every-m 0`\n\n"
     "`skyfix emulate drives/kitti_00 --odometry sptam --correlation 0.9 --markdown emulated.md`"
 )(emulate)
-app.command(epilog="Example: `skyfix retrieve drives/kitti_360 --index maps/karlsruhe.npz --places places.csv`")(
-    retrieve
-)
+app.command(
+    epilog="Examples:\n\n"
+    "`skyfix retrieve drives/kitti_360 --index maps/karlsruhe.npz --places places.csv`\n\n"
+    "`skyfix retrieve drives/mine --matcher runs/mine/rotmatch.safetensors --embedding runs/mine/places.safetensors`"
+)(retrieve)
+app.command(
+    "train-places",
+    epilog="Example: `skyfix train-places learned/weights/rotmatch.yaml --data osm "
+    "--matcher runs/mine/rotmatch.safetensors --out runs/mine/places.safetensors`",
+)(train_places)
 
 app.command(
     "map",

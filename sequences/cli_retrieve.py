@@ -1,4 +1,4 @@
-"""The command `skyfix retrieve`; `sequences.cli` lists it."""
+"""The commands `skyfix retrieve` and `train-places`; `sequences.cli` lists them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,19 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.progress import Progress
 
 from fusion.errors import SkyfixError
-from sequences.cli_options import JsonOption, MaxFramesOption, SeedOption, write_json, write_text
+from sequences.cli_options import (
+    CacheOption,
+    ExtractsOption,
+    JsonOption,
+    MaxFramesOption,
+    SeedOption,
+    write_json,
+    write_text,
+)
 
 
 def retrieve(
@@ -16,6 +26,14 @@ def retrieve(
     index_file: Annotated[
         Path | None,
         typer.Option("--index", help="Read the map's index from this file, or make it and write it.", metavar="FILE"),
+    ] = None,
+    matcher: Annotated[
+        str,
+        typer.Option(help="Whose features are looked up: rotmatch (shipped) or a checkpoint of it.", metavar="FILE"),
+    ] = "rotmatch",
+    embedding: Annotated[
+        Path | None,
+        typer.Option(help="Of these features, by `skyfix train-places`. Default: the shipped one.", metavar="FILE"),
     ] = None,
     shortlist: Annotated[
         int, typer.Option(help="Places that are looked at again with the network's vote.", metavar="N")
@@ -33,6 +51,8 @@ def retrieve(
 
     The places are written with --places. Where there is ground truth: how often is the right 64 m tile found?
     """
+    from learned.matcher import load_matcher
+    from learned.place_embedding import PlaceEmbedding
     from learned.retrieval import Retriever
     from learned.rotmatch import RotMatch
     from sequences.registry import OpenOptions, open_sequence
@@ -40,7 +60,11 @@ def retrieve(
 
     if not 1 <= top <= max(RECALL_AT):
         raise SkyfixError(f"top: expected 1 to {max(RECALL_AT)} places, got {top}")
-    opened, retriever = open_sequence(sequence, OpenOptions(seed)), Retriever(RotMatch.shipped())
+    network = load_matcher(matcher)
+    if not isinstance(network, RotMatch):
+        raise SkyfixError(f"--matcher: expected rotmatch or a checkpoint of it, got {matcher}")
+    retriever = Retriever(network, None if embedding is None else PlaceEmbedding.load(embedding))
+    opened = open_sequence(sequence, OpenOptions(seed))
     if opened.ground_truth is None and places_file is None:
         raise SkyfixError(
             f"{opened.name}: expected ground truth to score places against, or --places FILE; got neither"
@@ -52,3 +76,38 @@ def retrieve(
     write_json(json_file, summary)
     if places_file is not None:
         write_text(places_file, places_csv(answers, top))
+
+
+def train_places(
+    config: Annotated[
+        Path,
+        typer.Argument(help="YAML file of a training that simulates scans to 72 m.", metavar="CONFIG"),
+    ],
+    out: Annotated[Path, typer.Option(help="File to write, .safetensors.", metavar="FILE")],
+    data: ExtractsOption = Path(),
+    matcher: Annotated[
+        str, typer.Option(help="Whose features: rotmatch (shipped) or a checkpoint of it.", metavar="FILE")
+    ] = "rotmatch",
+    scans_per_area: Annotated[
+        int, typer.Option(help="Of each neighbourhood that CONFIG simulates, use so many scans.", metavar="N")
+    ] = 4,
+    cache: CacheOption = None,
+    seed: Annotated[int, typer.Option(help="Of batches and of where places are shown. Same seed, same weights.")] = 0,
+) -> None:
+    """Train an embedding of places, for `retrieve`, on scans simulated in OpenStreetMap extracts.
+
+    The network itself stays as it is; an embedding is of the features of one network alone.
+    """
+    from learned.place_training import PlaceTraining
+    from sequences.train_places import PlaceOptions, train_embedding
+
+    options = PlaceOptions(matcher, scans_per_area, cache, PlaceTraining(seed=seed))
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("scans", total=None)
+        facts = train_embedding(
+            config, data, out, options, lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    found = facts["validation"]
+    shares = ", ".join(f"{100 * share:.0f} % among the best {k}" for k, share in found["recall"].items())
+    typer.echo(f"embedding: {out}; of {found['places']} unseen scans and their places, its own is {shares}")

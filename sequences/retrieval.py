@@ -1,10 +1,9 @@
-"""Place embeddings from simulated scans, and how often an index answers a drive's scans with the right tile."""
+"""A drive's scans looked up in an index of its map, and how often the right tile is among the answers."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,59 +13,12 @@ import numpy as np
 from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
-from learned.place_embedding import PlaceEmbedding
 from learned.place_index import PlaceIndex
-from learned.place_training import PlaceTraining, pairs_of, train_places
 from learned.retrieval import Retriever, map_digest
-from learned.ring_harmonics import RingHarmonics
-from learned.rotmatch import RotMatch
-from learned.samples import Sample
 from sequences.drive import STAMP_TOLERANCE_NS
 from sequences.sequence import ScanError, Sequence
-from sequences.train_command import find_extract
-from sequences.train_config import read_config
-from sequences.training_data import SimulatedSamples
 
 RECALL_AT = (1, 5, 10, 50, 100)
-_JITTER_M = 3.0
-"""Places of an index are metres apart, and a scan is taken between them."""
-
-
-def train_embedding(
-    config: Path, data: Path, cache: Path, settings: PlaceTraining, scans_per_area: int
-) -> PlaceEmbedding:
-    """Train the embedding of the shipped RotMatch's features on the samples of a `skyfix train` configuration.
-
-    Parameters
-    ----------
-    config
-        Scans have to be simulated as far as the rings reach.
-    data, cache
-        Folders of the OpenStreetMap extracts and of the simulated samples.
-    scans_per_area
-        Of each neighbourhood, so many samples are used.
-    """
-    plan = read_config(config)
-    harmonics = RingHarmonics()
-    if plan.simulation.bev_half_extent_m != harmonics.reach_m:
-        raise SkyfixError(
-            f"config {config.name}: expected scans simulated to {harmonics.reach_m:g} m, "
-            f"got {plan.simulation.bev_half_extent_m:g} m"
-        )
-    extracts = [(find_extract(name, data), weight) for name, weight in plan.extracts.items()]
-    source = SimulatedSamples(extracts, plan.simulation, cache)
-    net = RotMatch.shipped().net
-    pairs = pairs_of(net, _displaced(source, scans_per_area, settings.seed), harmonics)
-    return train_places(net, pairs, harmonics, settings)
-
-
-def _displaced(source: SimulatedSamples, scans_per_area: int, seed: int) -> Iterator[tuple[Sample, FloatArray]]:
-    """Samples, another of each neighbourhood in every round, and how far the places shown with them lie away."""
-    for turn in range(scans_per_area):
-        for area in range(source.areas):
-            samples = source.area(area)
-            offset = np.random.default_rng((seed, turn, area)).uniform(-_JITTER_M, _JITTER_M, 2)
-            yield samples[(4 * turn + area) % len(samples)], offset
 
 
 def index_of(sequence: Sequence, retriever: Retriever, path: Path | None) -> PlaceIndex:

@@ -16,6 +16,7 @@ from made_drive import EmulatedMatcher, MadeDrive, write_made_drive
 import sequences.sweep
 from fusion.errors import SkyfixError
 from sequences.cli import main
+from sequences.registry import OpenOptions
 from sequences.run_files import read_metrics
 from sequences.sweep import sweep
 from sequences.sweep_plan import SweepOptions, plan_runs
@@ -156,6 +157,22 @@ def test_a_run_that_fails_is_listed_and_the_others_are_done(
     assert content["failed"] == {"bend, steps, rotmatch, seed 0": "odometry: expected steps, got none"}
     assert [table["odometry"] for table in content["tables"]] == ["wheels"]
     assert "- bend, steps, rotmatch, seed 0: odometry: expected steps, got none\n" in (out / "sweep.md").read_text()
+
+
+def test_a_drive_is_opened_with_the_seed_of_its_run(
+    made: MadeDrive, emulated: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where scans are simulated, they are of that seed."""
+    seeds: list[int] = []
+
+    def opening(path: Path, options: OpenOptions) -> None:
+        seeds.append(options.seed)
+        raise SkyfixError("drive: expected one, got none")
+
+    monkeypatch.setattr(sequences.sweep, "open_sequence", opening)
+    with pytest.raises(SkyfixError, match=r"2 of 2 runs failed, see .*: drive: expected one, got none"):
+        sweep([made.path], SweepOptions(("wheels",), seeds=(3, 5)), tmp_path / "out")
+    assert seeds == [3, 5]
 
 
 def test_several_at_once_give_the_same_numbers(made: MadeDrive, tmp_path: Path) -> None:
