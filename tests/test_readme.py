@@ -62,7 +62,7 @@ def named_commands() -> dict[str, set[str]]:
         texts += [block.replace("\\\n", " ") for block in blocks_of(page, "sh")]
         texts += [inline.replace("\n", " ") for inline in re.findall(r"(?<!`)`([^`]+)`(?!`)", page)]
     found: dict[str, set[str]] = {}
-    for command, rest in re.findall(r"\bskyfix ([a-z]+)([^#\n]*)", "\n".join(texts)):
+    for command, rest in re.findall(r"\bskyfix ([a-z-]+)([^#\n]*)", "\n".join(texts)):
         found.setdefault(command, set()).update(re.findall(r"--[a-z-]+", rest))
     return found
 
