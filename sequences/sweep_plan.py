@@ -27,7 +27,7 @@ class SweepOptions:
     Attributes
     ----------
     odometries
-        Names; of each drive those that it has. None: those that are not emulated, or all where all are.
+        Names; of each drive those that it has. Empty: those that are not emulated, or all where all are.
     matchers
         As `learned.matcher.load_matcher` takes them.
     seeds
@@ -55,10 +55,8 @@ class SweepRun:
 
     Attributes
     ----------
-    drive
-        As `sequences.registry.open_sequence` takes it, and the name of what it opens.
-    name
-        The drive's.
+    drive, name
+        As `sequences.registry.open_sequence` takes it, and what the drive calls itself.
     matcher
         As `load_matcher` takes it.
     settings
@@ -88,8 +86,9 @@ class SweepRun:
 
 
 def matcher_label(matcher: str) -> str:
-    """A matcher's name, without the folder and ending of its file."""
-    return Path(matcher).stem
+    """A matcher's name: of a checkpoint its folder's and its own, for those of one network are called alike."""
+    path = Path(matcher)
+    return f"{path.resolve().parent.name}/{path.stem}" if path.suffix else path.name
 
 
 def plan_runs(drives: Sequence[Path], options: SweepOptions, out_dir: Path) -> list[SweepRun]:

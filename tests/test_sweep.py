@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -63,8 +64,11 @@ def test_a_plan_is_every_combination_with_the_seeds_outermost(made: MadeDrive, t
     assert {run.settings.measure_every_m for run in runs} == {6.0}
     assert {tuple(run.changes) for run in runs} == {("particles",)}
     assert runs[0].folder == tmp_path / "runs" / "bend-steps-rotmatch-particles-300" / "seed-0"
-    only = plan_runs([made.path], SweepOptions(odometries=("emulated", "gps")), tmp_path)
-    assert [run.settings for run in only] == [TrackSettings("emulated")]
+    own = str(tmp_path / "mine" / "rotmatch.safetensors")
+    only = plan_runs([made.path], SweepOptions(("emulated", "gps"), ("rotmatch", own)), tmp_path)
+    assert [run.settings for run in only] == 2 * [TrackSettings("emulated")]
+    assert [run.variant for run in only] == ["rotmatch", "mine/rotmatch"]
+    assert only[1].folder == tmp_path / "runs" / "bend-emulated-mine_rotmatch" / "seed-0"
 
 
 def test_tables_are_of_what_the_runs_hold(swept: Path) -> None:
@@ -114,19 +118,33 @@ def test_what_is_there_is_not_tracked_again(
 
 
 def test_other_runs_in_the_folder_are_kept(
-    made: MadeDrive, swept: Path, emulated: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made: MadeDrive, swept: Path, emulated: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sequences.sweep, "track", None)
     others = replace(GRID, overrides=SETTINGS[:2])
     with pytest.raises(SkyfixError, match=r"was tracked with filter\.resampler residual and not systematic") as caught:
         sweep([made.path], others, swept)
     assert "\n" not in str(caught.value)
-    weights = tmp_path / "rotmatch.safetensors"  # of the shipped one's name, and newer than the runs
+
+
+def test_runs_of_weights_that_have_changed_since_are_refused(
+    made: MadeDrive, swept: Path, emulated: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sequences.sweep, "track", None)
+    weights = tmp_path / "net.safetensors"
     weights.write_bytes(b"")
-    newest = max(path.stat().st_mtime for path in swept.rglob("metrics.json"))
+    mine = replace(GRID, matchers=(str(weights),))
+    out = tmp_path / "out"
+    for before, now in zip(plan_runs([made.path], GRID, swept), plan_runs([made.path], mine, out), strict=True):
+        shutil.copytree(before.folder, now.folder)
+    newest = max(path.stat().st_mtime for path in out.rglob("metrics.json"))
     os.utime(weights, (newest + 10.0, newest + 10.0))
-    with pytest.raises(SkyfixError, match=r"is older than .*rotmatch\.safetensors; choose another --out"):
-        sweep([made.path], replace(GRID, matchers=(str(weights),)), swept)
+    with pytest.raises(SkyfixError, match=r"is older than .*net\.safetensors; choose another --out"):
+        sweep([made.path], mine, out)
+    os.utime(weights, (0.0, 0.0))
+    said: list[str] = []
+    sweep([made.path], mine, out, report=said.append)
+    assert said == ["4 of 4 runs are there already"]
 
 
 def test_a_run_that_fails_is_listed_and_the_others_are_done(
@@ -194,7 +212,7 @@ def test_several_at_once_give_the_same_numbers(made: MadeDrive, tmp_path: Path) 
         ({"seeds": ()}, "--seeds: expected distinct numbers"),
         ({"seeds": (1, 1)}, "--seeds: expected distinct numbers"),
         ({"matchers": ()}, "--matcher: expected matchers of distinct names, got none"),
-        ({"matchers": ("a/net.safetensors", "b/net.safetensors")}, "distinct names, got net, net"),
+        ({"matchers": ("x/a/net.safetensors", "y/a/net.safetensors")}, "distinct names, got a/net, a/net"),
         ({"odometries": ("gps",)}, "bend: expected one of gps, found emulated, steps, wheels"),
         ({"overrides": ("particles=[]",)}, r"--set particles=\[\]: expected a value or a list of them"),
         ({"overrides": ("particles=[300, none]",)}, "--set particles=none: Input should be a valid integer"),
