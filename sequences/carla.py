@@ -85,7 +85,9 @@ class CarlaRoute:
         self.stamps_ns = np.array([frame_number(file) for file in self._files], dtype=np.int64) * FRAME_NS
         truth = Trajectory(self.stamps_ns, poses, None, "map")
         self.ground_truth: Trajectory | None = truth
-        self._odometry = OdometryFiles(route, self.name, {"emulated": lambda: emulate_odometry(truth, seed)})
+        self._odometry = OdometryFiles(
+            route, self.name, lambda: self.stamps_ns, {"emulated": lambda: emulate_odometry(truth, seed)}
+        )
         self.odometry_names = self._odometry.names
 
     def scan(self, index: int) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
     DIR/map.json, DIR/*.png     see `map_source`
     DIR/ground_truth.tum        optional; map frame; may be denser than the scans
-    DIR/odometry/NAME.tum       drifting trajectories in a frame of their own
+    DIR/odometry/NAME.tum       drifting trajectories in a frame of their own; or .txt or .csv, see `odometry_formats`
     DIR/scans/NNNNNN.bin        float32 (x, y, z, reflectance), KITTI velodyne layout; or all of them .npy, .pcd or
                                 .ply, see `point_file`; NNNNNN counts the lines of times.txt
     DIR/scans/times.txt         seconds, one a scan
@@ -62,7 +62,7 @@ class FolderSequence:
         self.origin_lat_lon = read_origin(self._path)
         truth_file = self._path / "ground_truth.tum"
         self.ground_truth: Trajectory | None = read_tum(truth_file) if truth_file.exists() else None
-        self._odometry = OdometryFiles(self._path, self.name)
+        self._odometry = OdometryFiles(self._path, self.name, lambda: self.stamps_ns)
         self.odometry_names: tuple[str, ...] = self._odometry.names
         self._lidar = LidarModel()
         self._has_scans = (self._path / "scans").is_dir()

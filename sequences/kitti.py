@@ -74,7 +74,7 @@ class KittiDrive:
             return Trajectory(oxts.stamps_ns, se2.between(moved[:1], moved), None, GPS_AIDED)
 
         made = {GPS_AIDED: gps_aided, "emulated": lambda: emulate_odometry(truth, seed)}
-        self._odometry = OdometryFiles(drive, self.name, made)
+        self._odometry = OdometryFiles(drive, self.name, lambda: self.stamps_ns, made)
         self.odometry_names = self._odometry.names
 
     def scan(self, index: int) -> NDArray[np.float32]:

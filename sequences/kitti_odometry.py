@@ -68,7 +68,7 @@ class KittiOdometrySequence:
         truth = self._truth(folder)
         self.ground_truth: Trajectory | None = truth
         made = {} if truth is None else {"emulated": lambda: emulate_odometry(truth, seed)}
-        self._odometry = OdometryFiles(folder, self.name, made)
+        self._odometry = OdometryFiles(folder, self.name, lambda: self.stamps_ns, made)
         self.odometry_names = self._odometry.names
 
     def scan(self, index: int) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Odometry beside a drive: `odometry/NAME.tum` files, and what a reader can make itself."""
+"""Odometry beside a drive: files in `odometry/`, see `odometry_formats`, and what a reader can make itself."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
-from sequences.trajectory_io import read_odometry
+from sequences.odometry_formats import FORMATS, read_odometry
 
 
 class OdometryFiles:
@@ -20,15 +23,31 @@ class OdometryFiles:
         Holds `odometry/`, or does not.
     label
         Names the drive in errors.
+    scan_stamps_ns
+        Gives the stamps of the drive's scans, (N,).
     made
         Odometries that the reader makes, by name; a file of the same name goes before it.
+
+    Raises
+    ------
+    SkyfixError
+        If two files are of one name.
     """
 
-    def __init__(self, folder: Path, label: str, made: Mapping[str, Callable[[], Trajectory]] | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        label: str,
+        scan_stamps_ns: Callable[[], NDArray[np.int64]],
+        made: Mapping[str, Callable[[], Trajectory]] | None = None,
+    ) -> None:
         self._label = label
-        self._readers: dict[str, Callable[[], Trajectory]] = dict(made or {})
-        for file in folder.glob("odometry/*.tum"):
-            self._readers[file.stem] = partial(read_odometry, file, file.stem)
+        files: dict[str, Path] = {}
+        for file in sorted(folder.glob("odometry/*")):
+            if file.suffix in FORMATS and files.setdefault(file.stem, file) != file:
+                raise SkyfixError(f"odometry: expected one file of a name, got {files[file.stem].name} and {file.name}")
+        read = {name: partial(read_odometry, file, name, scan_stamps_ns) for name, file in files.items()}
+        self._readers: dict[str, Callable[[], Trajectory]] = {**(made or {}), **read}
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
-from sequences.odometry_axes import on_the_ground, planar
+from sequences.odometry_axes import on_the_ground
 
 _NS_PER_S = 1_000_000_000
 _TUM_COLUMNS = 8
@@ -40,20 +41,8 @@ def read_tum(path: Path, frame_id: str = "map") -> Trajectory:
         If the file is missing, empty or unreadable, a line is not eight finite numbers, a quaternion has no length,
         or a stamp does not increase. The message names the file and the line.
     """
-    stamps, positions, rotations = _read_poses(path)
+    stamps, positions, rotations = read_poses(path)
     return Trajectory(stamps, on_the_ground(positions, rotations), None, frame_id)
-
-
-def read_odometry(path: Path, name: str) -> Trajectory:
-    """Read a TUM file in a frame of its own, of a body or of a camera; see `sequences.odometry_axes`.
-
-    Raises
-    ------
-    SkyfixError
-        As `read_tum` does, and if the axes are neither a body's nor a camera's.
-    """
-    stamps, positions, rotations = _read_poses(path)
-    return Trajectory(stamps, planar(positions, rotations, name), None, name)
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -68,10 +57,10 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 def read_times(path: Path) -> NDArray[np.int64]:
     """Read `times.txt` (seconds, one a line) as (N,) int64 nanoseconds; raises `SkyfixError` as `read_tum` does."""
     stamps: list[int] = []
-    for number, fields in _lines(path):
+    for number, fields in text_fields(path):
         if len(fields) != 1:
             raise SkyfixError(f"{path.name}: line {number}: expected one number (seconds), got {len(fields)}")
-        stamps.append(_stamp(fields[0], path, number, stamps))
+        stamps.append(rising_stamp(fields[0], path, number, stamps))
     if not stamps:
         raise SkyfixError(f"{path.name}: expected at least one stamp, got none")
     return np.array(stamps, dtype=np.int64)
@@ -83,47 +72,55 @@ def format_seconds(stamp_ns: int) -> str:
     return f"{sign}{magnitude // _NS_PER_S}.{magnitude % _NS_PER_S:09d}"
 
 
-def _read_poses(path: Path) -> tuple[NDArray[np.int64], FloatArray, Rotation]:
-    """Stamps (N,), positions (N, 3) and N rotations of a TUM file."""
+def read_poses(path: Path) -> tuple[NDArray[np.int64], FloatArray, Rotation]:
+    """Stamps (N,), positions (N, 3) and N rotations of a TUM file; raises `SkyfixError` as `read_tum` does."""
     stamps: list[int] = []
     rows: list[list[float]] = []
-    for number, fields in _lines(path):
+    for number, fields in text_fields(path):
         if len(fields) != _TUM_COLUMNS:
             raise SkyfixError(
                 f"{path.name}: line {number}: expected 8 numbers (t x y z qx qy qz qw), got {len(fields)}"
             )
-        stamps.append(_stamp(fields[0], path, number, stamps))
-        rows.append([_number(field, path, number) for field in fields[1:]])
-        if np.linalg.norm(rows[-1][3:]) < 1e-6:
-            raise SkyfixError(f"{path.name}: line {number}: expected a unit quaternion, got zero length")
+        stamps.append(rising_stamp(fields[0], path, number, stamps))
+        pose = [finite_number(field, path, number) for field in fields[1:]]
+        rows.append([*pose[:3], *unit_rotation(pose[3:], path, number)])
     if not stamps:
         raise SkyfixError(f"{path.name}: expected at least one pose, got none")
     values = np.array(rows, dtype=np.float64)
     return np.array(stamps, dtype=np.int64), values[:, :3], Rotation.from_quat(values[:, 3:])
 
 
-def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+def text_fields(path: Path, separator: str | None = None) -> Iterator[tuple[int, list[str]]]:
+    """Number and fields of every line that has any, comments taken off; white space separates where nothing else does.
+
+    Raises
+    ------
+    SkyfixError
+        If the file is missing or not of text.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise SkyfixError(f"{path}: cannot be read: {reason}") from error
     for number, line in enumerate(text.splitlines(), start=1):
-        content = line.split("#", 1)[0].split()
+        content = line.split("#", 1)[0].strip()
         if content:
-            yield number, content
+            yield number, [field.strip() for field in content.split(separator)]
 
 
-def _stamp(field: str, path: Path, number: int, earlier: list[int]) -> int:
-    _number(field, path, number)
-    stamp = int((Decimal(field) * _NS_PER_S).to_integral_value())
+def rising_stamp(field: str, path: Path, number: int, earlier: list[int], unit: Literal["s", "ns"] = "s") -> int:
+    """Nanoseconds of a field, which have to be more than the last of the earlier ones; `SkyfixError` otherwise."""
+    finite_number(field, path, number)
+    stamp = int((Decimal(field) * (_NS_PER_S if unit == "s" else 1)).to_integral_value())
     if earlier and stamp <= earlier[-1]:
-        before = format_seconds(earlier[-1])
-        raise SkyfixError(f"{path.name}: line {number}: stamps must increase, got {field} s after {before} s")
+        before = format_seconds(earlier[-1]) if unit == "s" else earlier[-1]
+        raise SkyfixError(f"{path.name}: line {number}: stamps must increase, got {field} {unit} after {before} {unit}")
     return stamp
 
 
-def _number(field: str, path: Path, number: int) -> float:
+def finite_number(field: str, path: Path, number: int) -> float:
+    """The number that a field of a line holds; `SkyfixError` if there is none or it is not finite."""
     try:
         value = float(Decimal(field))
     except InvalidOperation:
@@ -131,3 +128,10 @@ def _number(field: str, path: Path, number: int) -> float:
     if not np.isfinite(value):
         raise SkyfixError(f"{path.name}: line {number}: expected a finite number, got {field}")
     return value
+
+
+def unit_rotation(quaternion: list[float], path: Path, number: int) -> list[float]:
+    """The quaternion x, y, z, w of a line, of any length; `SkyfixError` if it has none."""
+    if np.linalg.norm(quaternion) < 1e-6:
+        raise SkyfixError(f"{path.name}: line {number}: expected a unit quaternion, got zero length")
+    return quaternion

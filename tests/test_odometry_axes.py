@@ -16,7 +16,8 @@ from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from sequences.folder import FolderSequence
 from sequences.odometry_axes import on_the_ground, planar
-from sequences.trajectory_io import read_odometry, read_tum
+from sequences.odometry_formats import read_odometry
+from sequences.trajectory_io import read_tum
 
 CAMERA = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # forward, left, up -> right, down, forward
 

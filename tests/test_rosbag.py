@@ -18,11 +18,12 @@ from fusion.errors import SkyfixError
 from sequences.bag_folder import BagRequest, write_bag_folder
 from sequences.cli import app
 from sequences.ground_height import estimate_ground_z
+from sequences.odometry_formats import read_odometry
 from sequences.point_cloud2 import points_of_message
 from sequences.point_file import read_points
 from sequences.rosbag import open_bag
 from sequences.sequence import ScanError
-from sequences.trajectory_io import read_odometry, read_times
+from sequences.trajectory_io import read_times
 
 
 def in_body(points: np.ndarray) -> np.ndarray:
