@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from made_drive import MadeDrive
@@ -15,10 +17,11 @@ import sequences.train_places
 from fusion.errors import SkyfixError
 from learned.calibration import Calibration
 from learned.place_embedding import PlaceEmbedding
-from learned.place_training import PlaceTraining
+from learned.place_training import PlacePairs, PlaceTraining, pairs_of
 from learned.retrieval import Retriever, fingerprint_of
 from learned.ring_harmonics import RingHarmonics
 from learned.rotmatch import RotMatch, RotMatchNet, RotMatchSettings
+from learned.samples import Sample
 from sequences.cli import main
 from sequences.train_places import PlaceOptions, recall_among, train_embedding
 
@@ -67,6 +70,29 @@ def test_an_embedding_comes_out_with_its_provenance_and_answers_for_its_network(
     for name, values in load_file(out).items():
         assert torch.equal(load_file(again)[name], values), name
     assert not list(tmp_path.rglob("*.part"))
+    assert not list(tmp_path.rglob("cache"))
+    assert options.cache_dir is not None
+    assert len(list((options.cache_dir / "training").glob("area_*.npz"))) == 2
+
+
+def test_places_are_shown_beside_where_the_scans_were_taken(
+    config: Path, options: PlaceOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By up to 3 m along each axis, those of the unseen scans too."""
+    offsets: list[np.ndarray] = []
+
+    def watched(net: RotMatchNet, samples: Iterable[tuple[Sample, np.ndarray]], harmonics: RingHarmonics) -> PlacePairs:
+        kept = list(samples)
+        offsets.append(np.array([offset for _, offset in kept]))
+        return pairs_of(net, kept, harmonics)
+
+    monkeypatch.setattr(sequences.train_places, "pairs_of", watched)
+    train_embedding(config, tmp_path, tmp_path / "places.safetensors", options)
+    assert [len(each) for each in offsets] == [4, 6]
+    for each in offsets:
+        assert (np.abs(each) <= 3.0).all()
+        assert len(np.unique(each)) == each.size
+        assert np.abs(each).max() > 1.0
 
 
 def test_a_scan_that_looks_like_its_own_place_and_no_other_is_found() -> None:
@@ -76,10 +102,12 @@ def test_a_scan_that_looks_like_its_own_place_and_no_other_is_found() -> None:
     embedding = PlaceEmbedding(weights, weights, *torch.zeros(2, 9), "", RINGS)
     turned = seen * torch.exp(1j * torch.arange(5) * torch.linspace(-3.0, 3.0, 20)[:, None])[:, None]
     yaws, positions = torch.zeros(20), torch.zeros(20, 2)
-    right = sequences.train_places.PlacePairs(turned, seen, yaws, positions)
+    right = PlacePairs(turned, seen, yaws, positions)
     assert recall_among(embedding, right)["recall"] == {"1": 1.0, "5": 1.0, "10": 1.0}
-    swapped = sequences.train_places.PlacePairs(turned, seen.roll(1, 0), yaws, positions)
+    swapped = PlacePairs(turned, seen.roll(1, 0), yaws, positions)
     assert recall_among(embedding, swapped)["recall"]["1"] == 0.0
+    all_alike = PlacePairs(seen[:1].expand_as(seen), seen, yaws, positions)
+    assert recall_among(embedding, all_alike)["recall"]["1"] == 1 / 20  # ranked are places for a scan, not scans
 
 
 def test_the_command_trains_and_retrieve_takes_what_it_wrote(
