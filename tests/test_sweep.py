@@ -174,6 +174,7 @@ def test_a_run_that_fails_is_listed_and_the_others_are_done(
     assert (content["runs_done"], content["runs_planned"]) == (1, 2)
     assert content["failed"] == {"bend, steps, rotmatch, seed 0": "odometry: expected steps, got none"}
     assert [table["odometry"] for table in content["tables"]] == ["wheels"]
+    assert content["tables"][0]["variants"]["rotmatch"]["seeds"] == [0]
     assert "- bend, steps, rotmatch, seed 0: odometry: expected steps, got none\n" in (out / "sweep.md").read_text()
 
 
