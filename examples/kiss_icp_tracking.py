@@ -18,7 +18,7 @@ from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
 from fusion import Tracker, TrackerSettings, UniformPrior, se2
-from learned.matcher import SearchRegion, load_matcher
+from learned.matcher import SearchRegion, error_correlation_length_m, load_matcher
 from sequences.folder import FolderSequence
 
 MEASURE_EVERY_M = 4.0
@@ -35,7 +35,7 @@ def main(folder: Path) -> None:
     config.data.deskew = False  # these scans are motion-compensated already
     config.mapping.voxel_size = 1.0
     odometry = KissICP(config)
-    settings = TrackerSettings(correlation_length_m=matcher.error_correlation_length_m)
+    settings = TrackerSettings(correlation_length_m=error_correlation_length_m(matcher, sequence.map))
     tracker = Tracker.from_prior(UniformPrior(guess, half_extent_m=20.0, half_heading_rad=0.2), settings=settings)
 
     way_m, measured_at_m, before, measurements, off, alone = 0.0, -np.inf, np.zeros(3), 0, np.nan, np.nan

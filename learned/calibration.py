@@ -44,6 +44,9 @@ class Calibration:
         Divides the scores.
     error_correlation_length_m
         Distance over which the errors of neighbouring frames decorrelate (1/e).
+    bare_map_correlation_length_m
+        The same on maps that show no buildings. What is left to go by there, how far walls and fences stand from a
+        carriageway, is guessed wrong for a whole street at a time.
     heading_concentration
         The density of the heading at each position is raised to this power; see `with_heading_concentration`.
     confidence_slope, confidence_intercept
@@ -52,15 +55,25 @@ class Calibration:
 
     temperature: float = 1.0
     error_correlation_length_m: float = 6.0
+    bare_map_correlation_length_m: float = 25.0
     heading_concentration: float = 1.0
     confidence_slope: float = 1.0
     confidence_intercept: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("temperature", "error_correlation_length_m", "heading_concentration"):
+        for name in (
+            "temperature",
+            "error_correlation_length_m",
+            "bare_map_correlation_length_m",
+            "heading_concentration",
+        ):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise SkyfixError(f"calibration {name}: expected above zero, got {value}")
+
+    def correlation_length_on(self, map_raster: MapRaster) -> float:
+        """Distance over which errors decorrelate on this map, metres."""
+        return self.error_correlation_length_m if map_raster.shows_buildings else self.bare_map_correlation_length_m
 
     def applied(self, volume: LikelihoodVolume) -> LikelihoodVolume:
         """A likelihood of the matcher before calibration -> one of the calibrated matcher."""

@@ -80,6 +80,11 @@ class MapRaster:
             raise SkyfixError(f"map classes: expected indices below {len(CLASSES)}, got {int(classes.max())}")
         return cls(grid, classes, PALETTE[classes])
 
+    @property
+    def shows_buildings(self) -> bool:
+        """Whether any building is on it; of a photograph it is taken for granted."""
+        return self.classes is None or bool((self.classes == CLASS_INDEX["building"]).any())
+
     def crop(self, window: MapGrid) -> MapRaster:
         """Cut a window that is snapped to this map's pixels; what lies outside the map is void (black)."""
         row0, col0 = self.grid.offset_of(window)

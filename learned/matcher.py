@@ -92,6 +92,22 @@ class BoundedMatcher(Protocol):
         ...
 
 
+@runtime_checkable
+class MapDependentErrors(Protocol):
+    """A `MapMatcher` whose errors repeat over another distance on some maps than on others."""
+
+    def error_correlation_length_on(self, map_raster: MapRaster) -> float:
+        """Distance travelled over which errors of neighbouring frames decorrelate on this map (1/e), metres."""
+        ...
+
+
+def error_correlation_length_m(matcher: MapMatcher, map_raster: MapRaster) -> float:
+    """Distance over which a matcher's errors decorrelate on a map, metres; the matcher's own where maps are alike."""
+    if isinstance(matcher, MapDependentErrors):
+        return matcher.error_correlation_length_on(map_raster)
+    return matcher.error_correlation_length_m
+
+
 def largest_half_extent_m(matcher: MapMatcher) -> float:
     """Half the side of the largest square of positions that a matcher searches, metres; infinite where it says none."""
     return matcher.largest_half_extent_m if isinstance(matcher, BoundedMatcher) else math.inf

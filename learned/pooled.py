@@ -20,7 +20,7 @@ from fusion.errors import SkyfixError
 from fusion.likelihood import LikelihoodVolume
 from learned.checkpoint import load_checkpoint
 from learned.map_raster import MapRaster
-from learned.matcher import MapMatcher, SearchRegion, largest_half_extent_m
+from learned.matcher import MapMatcher, SearchRegion, error_correlation_length_m, largest_half_extent_m
 from learned.rotmatch import RotMatch
 from learned.whole_map import WholeMapMatcher, WholeMapSearch
 
@@ -68,6 +68,10 @@ class PooledMatcher:
     def error_correlation_length_m(self) -> float:
         """The longest of any matcher's, metres."""
         return max(matcher.error_correlation_length_m for matcher in self.matchers)
+
+    def error_correlation_length_on(self, map_raster: MapRaster) -> float:
+        """The same on one map; see `learned.matcher.MapDependentErrors`."""
+        return max(error_correlation_length_m(matcher, map_raster) for matcher in self.matchers)
 
     @property
     def largest_half_extent_m(self) -> float:

@@ -57,6 +57,10 @@ class TransLocNetMatcher:
         """Distance over which errors decorrelate, metres."""
         return self.calibration.error_correlation_length_m
 
+    def error_correlation_length_on(self, map_raster: MapRaster) -> float:
+        """The same on one map; see `learned.matcher.MapDependentErrors`."""
+        return self.calibration.correlation_length_on(map_raster)
+
     @property
     def largest_half_extent_m(self) -> float:
         """Half the side of the crop that the network sees, metres; see `learned.matcher.BoundedMatcher`."""

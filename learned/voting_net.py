@@ -221,6 +221,10 @@ class VotingMatcher(Generic[Net]):
         """Distance over which errors decorrelate, metres."""
         return self.calibration.error_correlation_length_m
 
+    def error_correlation_length_on(self, map_raster: MapRaster) -> float:
+        """The same on one map; see `learned.matcher.MapDependentErrors`."""
+        return self.calibration.correlation_length_on(map_raster)
+
     def match(
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
     ) -> LikelihoodVolume:

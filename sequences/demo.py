@@ -42,7 +42,7 @@ _MARGIN_M = 100.0
 _MAP_METRES_PER_PIXEL = 0.5
 _WORLD_METRES_PER_PIXEL = 0.25
 _LANE_M = 3.6
-_CITY = WorldStyle(
+CITY = WorldStyle(
     slope=0.01,
     hill_amplitude_m=0.8,
     plot_share=0.25,
@@ -57,6 +57,7 @@ _CITY = WorldStyle(
     pedestrians_per_100m=4.0,
     traffic_per_km=8.0,
 )
+"""How the demo's world deviates from the map."""
 
 
 def helsinki_features() -> MapFeatures:
@@ -80,14 +81,16 @@ class DemoSequence:
     ----------
     seed
         Seed of the world, the scans and the odometry's errors. The streets driven are always the same.
+    style
+        How the world deviates from the map.
     """
 
     name = "demo"
     scans_simulated = True
     odometry_names: tuple[str, ...] = ("emulated",)
 
-    def __init__(self, seed: int = 0) -> None:
-        self._seed = seed
+    def __init__(self, seed: int = 0, style: WorldStyle = CITY) -> None:
+        self._seed, self._style = seed, style
         self._lidar = LidarModel()
         self._features = helsinki_features()
         self.origin_lat_lon = self._features.origin_lat_lon
@@ -139,5 +142,5 @@ class DemoSequence:
         size = np.ceil((self._path_xy.max(axis=0) + _MARGIN_M - low) / _MAP_METRES_PER_PIXEL).astype(int)
         grid = MapGrid(int(size[1]), int(size[0]), _MAP_METRES_PER_PIXEL, float(low[0]), float(low[1]))
         rng = np.random.default_rng((self._seed, 1))
-        world, map_raster = build_area(self._features, grid, _CITY, rng, _WORLD_METRES_PER_PIXEL)
+        world, map_raster = build_area(self._features, grid, self._style, rng, _WORLD_METRES_PER_PIXEL)
         return world.cleared(self._path_xy, _LANE_M), map_raster

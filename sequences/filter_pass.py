@@ -16,7 +16,7 @@ from fusion.odometry import OdometryIncrement, accumulate
 from fusion.particle_filter import ParticleFilter
 from fusion.prior import UniformPrior
 from fusion.two_level import TwoLevelLikelihood
-from learned.matcher import MapMatcher, largest_half_extent_m
+from learned.matcher import MapMatcher, error_correlation_length_m, largest_half_extent_m
 from sequences.anywhere import Predicted
 from sequences.anywhere_search import AnywhereSearch
 from sequences.drive import Drive
@@ -81,8 +81,8 @@ class FilterPass:
         self.log: list[str] = []
         self._drive, self._increments, self._matcher = drive, increments, matcher
         self._prior, self._settings = prior, settings
-        own = matcher.error_correlation_length_m
-        self._correlation_m = own if settings.correlation_length_m is None else settings.correlation_length_m
+        given = settings.correlation_length_m
+        self._correlation_m = error_correlation_length_m(matcher, drive.sequence.map) if given is None else given
         self._filter: ParticleFilter | None = None
         self._travelled_m = 0.0
         self._measured_at_m = 0.0

@@ -21,6 +21,7 @@ from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
 from fusion.odometry_errors import OdometryCalibration
 from fusion.trajectory import Trajectory
+from learned.map_raster import MapRaster
 from learned.matcher import SearchRegion
 from sequences.drive import load_drive
 from sequences.folder import FolderSequence
@@ -175,6 +176,16 @@ def test_correlated_errors_flatten_every_measurement_but_the_first(made_drive: M
     np.testing.assert_allclose(temperatures[1:], (1 + rho) / (1 - rho), rtol=1e-3)
     overridden = run(made_drive, replace(SETTINGS, correlation_length_m=0.0), error_correlation_length_m=10.0)
     assert {row.temperature for row in overridden.frame_rows if row.measured} == {1.0}
+
+
+def test_a_matcher_may_know_that_its_errors_repeat_over_more_on_this_map(made_drive: MadeDrive) -> None:
+    class OnBareMaps(EmulatedMatcher):
+        def error_correlation_length_on(self, map_raster: MapRaster) -> float:
+            return 10.0 if map_raster.shows_buildings else 99.0
+
+    rows = track(FolderSequence(made_drive.path), OnBareMaps(made_drive.truth.poses), SETTINGS).frame_rows
+    known = run(made_drive, error_correlation_length_m=10.0).frame_rows
+    assert [row.temperature for row in rows] == [row.temperature for row in known]
 
 
 def test_a_bad_scan_is_skipped_and_reported(made_drive: MadeDrive) -> None:

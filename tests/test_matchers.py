@@ -16,7 +16,7 @@ from learned.bev import BevSettings, bev_counts
 from learned.calibration import fit_temperature, match_samples, mean_nll
 from learned.geometric import GeometricMatcher
 from learned.map_raster import CLASS_INDEX, MapRaster
-from learned.matcher import SearchRegion, load_matcher, matching_window
+from learned.matcher import SearchRegion, error_correlation_length_m, load_matcher, matching_window
 from learned.rotmatch import Calibration, RotMatch, RotMatchNet, RotMatchSettings
 from learned.samples import Sample
 
@@ -115,7 +115,7 @@ def test_samples_are_matched_in_their_own_frame() -> None:
 
 def test_checkpoint_round_trip(tmp_path: Path) -> None:
     torch.manual_seed(4)
-    matcher = RotMatch(RotMatchNet(SMALL), Calibration(1.7, 9.0))
+    matcher = RotMatch(RotMatchNet(SMALL), Calibration(1.7, 9.0, 33.0))
     matcher.save(tmp_path / "net.safetensors", {"seed": 4})
     again = load_matcher(str(tmp_path / "net.safetensors"))
     city, scan = street_of_walls(np.zeros(3))
@@ -123,6 +123,11 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
     first, second = (m.match(scan, -1.7, city, search) for m in (matcher, again))
     np.testing.assert_array_equal(first.log_prob, second.log_prob)
     assert again.error_correlation_length_m == 9.0
+    roads = MapRaster.from_classes(city.grid, np.full_like(city.classes, CLASS_INDEX["road"]))
+    photograph = MapRaster(city.grid, None, roads.picture)
+    shown = {"houses": city, "roads alone": roads, "a photograph": photograph}
+    lengths = {name: error_correlation_length_m(again, shown[name]) for name in shown}
+    assert lengths == {"houses": 9.0, "roads alone": 33.0, "a photograph": 9.0}
     assert json.loads((tmp_path / "net.json").read_text())["seed"] == 4
 
 

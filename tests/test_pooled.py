@@ -8,7 +8,13 @@ import pytest
 from fusion import GaussianMixture, LikelihoodVolume, MapGrid, SkyfixError, se2
 from learned.geometric import GeometricMatcher
 from learned.map_raster import CLASS_INDEX, MapRaster
-from learned.matcher import MapMatcher, SearchRegion, largest_half_extent_m, load_matcher
+from learned.matcher import (
+    MapMatcher,
+    SearchRegion,
+    error_correlation_length_m,
+    largest_half_extent_m,
+    load_matcher,
+)
 from learned.pooled import PooledMatcher
 from learned.rotmatch import RotMatch
 from learned.whole_map import search_over
@@ -104,6 +110,9 @@ def test_bounds_are_those_of_the_tightest():
     assert PooledMatcher([GeometricMatcher()]).largest_half_extent_m == np.inf
     pair.matchers[1].error_correlation_length_m = 9.0
     assert pair.error_correlation_length_m == 9.0
+    assert error_correlation_length_m(pair, MAP) == 9.0
+    pair.matchers[0].error_correlation_length_on = lambda map_raster: 30.0 if map_raster is MAP else 1.0
+    assert error_correlation_length_m(pair, MAP) == 30.0
 
 
 def test_the_shipped_pair_is_loaded_by_name_and_searches_whole_maps_as_rotmatch_does():
