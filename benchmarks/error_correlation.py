@@ -2,37 +2,33 @@
 
     python -m benchmarks.error_correlation --worlds 6
 
-The same streets in several drawn worlds, a scan every few metres, each matched by itself within 20 m and 10 degrees
-with three maps of the same world: OpenStreetMap's, what an aerial image shows, and carriageways alone. The
-maps as a whole are not shifted against the world: that never decorrelates and is `TrackSettings.map_error_m`.
+The same streets in several drawn worlds (`benchmarks.drawn_drives`), a scan every few metres, each matched by itself
+within 20 m and 10 degrees with three maps of the same world. The maps as a whole are not shifted against the world:
+that never decorrelates and is `TrackSettings.map_error_m`. 'Prior only' answers the middle of the search.
 """
 
 from __future__ import annotations
 
 import math
-import sys
-from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 import typer
 from rich.progress import track
 
+from benchmarks.command import run
+from benchmarks.drawn_drives import DrawnDrive
 from fusion.arrays import FloatArray
 from fusion.error_correlation import estimate_error_correlation
-from fusion.errors import SkyfixError
 from learned.matcher import MapMatcher, SearchRegion, load_matcher
-from sequences.demo import CITY, DemoSequence
 from sequences.measurement import best_pose
 from sequences.metrics import distance_along, vehicle_frame_errors
-from sequences.world_overhead import drivable_map, overhead_map
-from sequences.world_style import WorldStyle
 
 _HALF_EXTENT_M, _HALF_HEADING_RAD = 20.0, math.radians(10.0)
 _OFF = np.array([12.0, 12.0, math.radians(8.0)])
 """Searches are centred up to so far from the truth."""
 _REACH_M = 120.0
-_STREAM = 3
+_STREAM = 4
 
 
 def main(
@@ -54,30 +50,20 @@ def main(
 
 
 def _errors(matcher: MapMatcher, number: int, every_m: float) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Distance travelled (N,) and, by the map's kind, errors (N, 3) of single shots in the vehicle's frame."""
-    rng = np.random.default_rng((number, _STREAM))
-    style = CITY if number == 0 else WorldStyle.random(rng)
-    drive = DemoSequence(number, replace(style, map_offset_m=0.0))
-    maps = {
-        "OpenStreetMap": drive.map,
-        "aerial image": overhead_map(drive.world, drive.map.grid, 0.0, rng),
-        "carriageways alone": drivable_map(drive.world, drive.map.grid, 0.0, rng),
-    }
+    """Distance travelled (N,) and, by the map's kind, errors (N, 3) along the vehicle of prior and single shots."""
+    drive, rng = DrawnDrive(number, map_offset_m=0.0), np.random.default_rng((number, _STREAM))
     along = distance_along(drive.ground_truth.poses)
     frames = np.unique(np.searchsorted(along, np.arange(0.0, along[-1], every_m)))
     truth = drive.ground_truth.poses[frames]
-    found: dict[str, list[FloatArray]] = {kind: [] for kind in maps}
-    for frame, centre in zip(frames.tolist(), truth + rng.uniform(-_OFF, _OFF, truth.shape), strict=True):
+    centres = truth + rng.uniform(-_OFF, _OFF, truth.shape)
+    found: dict[str, list[FloatArray]] = {"prior only": list(centres), **{kind: [] for kind in drive.maps}}
+    for frame, centre in zip(frames.tolist(), centres, strict=True):
         points, search = drive.scan(frame), SearchRegion(centre, _HALF_EXTENT_M, _HALF_HEADING_RAD)
-        for kind, shown in maps.items():
+        for kind, shown in drive.maps.items():
             found[kind].append(best_pose(matcher.match(points, drive.ground_z, shown, search)))
     errors = {kind: vehicle_frame_errors(truth, np.array(poses)) for kind, poses in found.items()}
     return along[frames], {kind: np.column_stack(columns) for kind, columns in errors.items()}
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except SkyfixError as error:
-        print(f"error_correlation: error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    run(main, "error_correlation")

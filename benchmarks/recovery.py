@@ -14,7 +14,6 @@ done, and a run that was stopped goes on. Scans may be simulated from the map; t
 from __future__ import annotations
 
 import json
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +22,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from benchmarks.command import run
 from benchmarks.recovery_drives import IncidentMaker
 from benchmarks.recovery_trials import WATCH_M, Trial, make_incident, run_trial, summary
 from fusion.errors import SkyfixError
@@ -109,8 +109,4 @@ def _table(of: dict[str, Any], found: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except SkyfixError as error:
-        print(f"recovery: error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    run(main, "recovery")

@@ -10,7 +10,6 @@ row 'prior' is tiles taken at random.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +18,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from benchmarks.command import run
 from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
@@ -161,8 +161,4 @@ def main(
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except SkyfixError as error:
-        print(f"retrieval: error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    run(main, "retrieval")

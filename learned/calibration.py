@@ -44,21 +44,21 @@ class Calibration:
         Divides the scores.
     error_correlation_length_m
         Distance over which the errors of neighbouring frames decorrelate (1/e).
-    bare_map_correlation_length_m
-        The same on maps that show no buildings. What is left to go by there, how far walls and fences stand from a
-        carriageway, is guessed wrong for a whole street at a time.
     heading_concentration
         The density of the heading at each position is raised to this power; see `with_heading_concentration`.
     confidence_slope, confidence_intercept
         From the mass in the best mode to the chance that it is right; see `learned.confidence`.
+    bare_map_correlation_length_m
+        As `error_correlation_length_m`, on maps that show no buildings. What is left to go by there, how far walls and
+        fences stand from a carriageway, is guessed wrong for a whole street at a time.
     """
 
     temperature: float = 1.0
     error_correlation_length_m: float = 6.0
-    bare_map_correlation_length_m: float = 25.0
     heading_concentration: float = 1.0
     confidence_slope: float = 1.0
     confidence_intercept: float = 0.0
+    bare_map_correlation_length_m: float = 25.0
 
     def __post_init__(self) -> None:
         for name in (

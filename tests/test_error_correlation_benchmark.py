@@ -1,5 +1,6 @@
 """The table of how far errors repeat, by the map's kind: with a matcher whose errors are known."""
 
+import math
 from functools import cached_property
 
 import numpy as np
@@ -7,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks import error_correlation as benchmark
+from benchmarks.drawn_drives import DrawnDrive
 from fusion.likelihood import LikelihoodVolume
 from learned.map_raster import MapRaster
 from learned.matcher import SearchRegion
-from sequences.demo import DemoSequence
 from sequences.metrics import distance_along
 
 LENGTH_M = {True: 6.0, False: 25.0}
@@ -18,8 +19,12 @@ LENGTH_M = {True: 6.0, False: 25.0}
 SIGMA_M = {True: 0.3, False: 2.0}
 
 
-class Numbered(DemoSequence):
-    """The demo's streets; a scan is nothing but its number."""
+class Numbered(DrawnDrive):
+    """The demo's streets; a scan is nothing but its number. The maps must not be shifted."""
+
+    def __init__(self, number: int, map_offset_m: float | None = None) -> None:
+        assert map_offset_m == 0.0
+        super().__init__(number, map_offset_m)
 
     def scan(self, index: int) -> NDArray[np.float32]:
         return np.array([[0.0, 0.0, 0.0, index]], np.float32)
@@ -31,7 +36,7 @@ class Repeating:
     name, error_correlation_length_m = "repeating", 0.0
 
     def __init__(self) -> None:
-        self._truth = Numbered().ground_truth.poses
+        self._truth = Numbered(0, 0.0).ground_truth.poses
 
     @cached_property
     def _errors(self) -> dict[bool, NDArray[np.float64]]:
@@ -63,13 +68,15 @@ def test_lengths_are_found_for_maps_of_either_kind(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(benchmark, "load_matcher", lambda name: Repeating())
-    monkeypatch.setattr(benchmark, "DemoSequence", Numbered)
+    monkeypatch.setattr(benchmark, "DrawnDrive", Numbered)
     benchmark.main(worlds=1, every_m=4.0)
     lines = capsys.readouterr().out.splitlines()
     assert "497 simulated scans in 1 worlds, repeating" in lines
     rows = {cells[1].strip(): cells for line in lines if len(cells := line.split("|")) == 6}
-    assert float(rows["OpenStreetMap"][2]) == pytest.approx(1.18 * 0.3, rel=0.15)  # a Rayleigh's median
-    assert float(rows["carriageways alone"][2]) == pytest.approx(1.18 * 2.0, rel=0.25)
-    assert float(rows["OpenStreetMap"][4]) == pytest.approx(6.0, abs=2.0)
-    assert float(rows["carriageways alone"][4]) == pytest.approx(25.0, abs=8.0)
+    assert float(rows["prior only"][2]) == pytest.approx(math.sqrt(2.0 / np.pi) * 12.0, rel=0.05)  # half of a square
+    assert float(rows["prior only"][4]) == 0.0
+    assert float(rows["OpenStreetMap"][2]) == pytest.approx(1.18 * 0.3, rel=0.05)  # a Rayleigh's median
+    assert float(rows["carriageways alone"][2]) == pytest.approx(1.18 * 2.0, rel=0.1)
+    assert float(rows["OpenStreetMap"][4]) == pytest.approx(6.0, abs=1.0)
+    assert float(rows["carriageways alone"][4]) == pytest.approx(25.0, abs=6.0)
     assert rows["aerial image"][2:] == rows["OpenStreetMap"][2:]

@@ -115,7 +115,7 @@ def test_samples_are_matched_in_their_own_frame() -> None:
 
 def test_checkpoint_round_trip(tmp_path: Path) -> None:
     torch.manual_seed(4)
-    matcher = RotMatch(RotMatchNet(SMALL), Calibration(1.7, 9.0, 33.0))
+    matcher = RotMatch(RotMatchNet(SMALL), Calibration(1.7, 9.0, bare_map_correlation_length_m=33.0))
     matcher.save(tmp_path / "net.safetensors", {"seed": 4})
     again = load_matcher(str(tmp_path / "net.safetensors"))
     city, scan = street_of_walls(np.zeros(3))

@@ -117,6 +117,8 @@ def test_bounds_are_those_of_the_tightest():
 
 def test_the_shipped_pair_is_loaded_by_name_and_searches_whole_maps_as_rotmatch_does():
     shipped = load_matcher("pooled")
+    bare = MapRaster.from_classes(MAP.grid, np.full((MAP.grid.rows, MAP.grid.cols), CLASS_INDEX["road"], np.uint8))
+    assert [error_correlation_length_m(each, bare) for each in (shipped, load_matcher("rotmatch"))] == [25.0, 25.0]
     assert isinstance(shipped, PooledMatcher)
     assert [matcher.name for matcher in shipped.matchers] == ["rotmatch", "hybrid"]
     np.testing.assert_allclose(shipped.shares, [2.0 / 3.0, 1.0 / 3.0])

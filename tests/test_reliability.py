@@ -146,3 +146,5 @@ def test_everything_is_fitted_together() -> None:
     assert Calibration().confidence(ready) == pytest.approx(peak_mass(ready))
     with pytest.raises(SkyfixError, match="calibration temperature: expected above zero, got 0"):
         Calibration(temperature=0.0)
+    with pytest.raises(SkyfixError, match="calibration bare_map_correlation_length_m: expected above zero, got -1"):
+        Calibration(bare_map_correlation_length_m=-1.0)

@@ -19,7 +19,7 @@ from learned.bev import BevSettings
 from learned.calibration import Calibration
 from learned.checkpoint import load_checkpoint, save_network
 from learned.map_raster import MapRaster
-from learned.matcher import SearchRegion
+from learned.matcher import SearchRegion, error_correlation_length_m
 from learned.translocnet import TransLocNet
 from learned.translocnet_losses import true_pose_nll
 from learned.translocnet_matcher import TransLocNetMatcher
@@ -128,6 +128,13 @@ def test_a_calibrated_answer_is_the_raw_one_calibrated(probabilistic: bool, half
     assert (ready.grid, ready.floor) == (expected.grid, expected.floor)
     tempered = Calibration(temperature=1.4).applied(raw)
     assert np.abs(ready.log_prob - tempered.log_prob)[raw.log_prob > raw.floor].max() > 0.01
+
+
+def test_errors_repeat_over_more_where_no_building_is_shown() -> None:
+    matcher = tiny_matcher(calibration=Calibration(error_correlation_length_m=8.0, bare_map_correlation_length_m=31.0))
+    roads = MapRaster.from_classes(CITY_GRID, np.zeros((200, 180), np.uint8))
+    assert error_correlation_length_m(matcher, city()) == 8.0  # a photograph
+    assert error_correlation_length_m(matcher, roads) == 31.0
 
 
 def test_maps_give_the_headings_their_concentration() -> None:
