@@ -42,6 +42,8 @@ class GaussianMixture:
         means = checked("mixture means", self.means, (len(weights), 3)).copy()
         means[:, 2] = se2.wrap(means[:, 2])
         covariances = checked("mixture covariances", self.covariances, (len(weights), 3, 3))
+        if not np.allclose(covariances, covariances.swapaxes(1, 2), rtol=1e-6, atol=1e-12):
+            raise SkyfixError("mixture covariances: expected symmetric matrices, got one that is not")
         if np.linalg.eigvalsh(covariances).min() <= 0.0:
             raise SkyfixError("mixture covariances: expected positive definite, got an eigenvalue <= 0")
         object.__setattr__(self, "weights", read_only(weights))

@@ -286,7 +286,7 @@ class FilterPass:
             sequence, truth = self._drive.sequence, self._drive.truth
             self.snapshots.append(
                 take_snapshot(
-                    frame,
+                    int(self._drive.indices[frame]),
                     measurement,
                     sequence.map,
                     sequence.ground_z,

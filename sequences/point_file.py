@@ -5,8 +5,9 @@
     .pcd    the Point Cloud Library's format, any encoding (extra `clouds`, package pypcd4)
     .ply    ASCII or binary (extra `clouds`, package trimesh)
 
-A .bin has to be exactly that. Of the others points that are not finite are left out, and the reflectance is what
-`intensity`, `reflectance` or `reflectivity` says, see `scan_of`.
+A .bin has to be exactly that, but for missing returns: points whose x, y and z are all NaN are left out. Of the others
+all points that are not finite are left out, and the reflectance is what `intensity`, `reflectance` or `reflectivity`
+says, see `scan_of`.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ def read_points(path: Path) -> NDArray[np.float32]:
     Raises
     ------
     ScanError
-        If the file is unreadable or not of its format, holds no points, or, a .bin, one that is not finite.
+        If the file is unreadable or not of its format, holds no points, or, a .bin, one that is not finite and no
+        missing return.
     SkyfixError
         If the package that reads the format is not installed.
     """
@@ -50,7 +52,7 @@ def read_points(path: Path) -> NDArray[np.float32]:
     except Exception as error:  # what readers of other people's make of a broken file is anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ScanError(f"{label}: cannot be read as {path.suffix}: {reason}") from error
-    return checked_points(columns, label) if isinstance(columns, np.ndarray) else scan_of(columns, label)
+    return checked_points(columns if isinstance(columns, np.ndarray) else scan_of(columns, label), label)
 
 
 def scan_of(columns: Mapping[str, NDArray[Any]], label: str) -> NDArray[np.float32]:
@@ -91,7 +93,8 @@ def _read_bin(path: Path) -> NDArray[np.float32]:
     if len(content) % _BYTES_PER_POINT:
         expected = f"a multiple of {_BYTES_PER_POINT} bytes (float32 x, y, z, reflectance)"
         raise ScanError(f"expected {expected}, got {len(content)}")
-    return np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(-1, SCAN_COLUMNS)
+    points = np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(-1, SCAN_COLUMNS)
+    return points[~np.isnan(points[:, :3]).all(axis=1)]
 
 
 def _read_npy(path: Path) -> Mapping[str, NDArray[Any]]:

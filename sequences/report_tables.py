@@ -48,7 +48,11 @@ class StageRow:
 
 
 def verdict(result: RunResult, series: RunSeries) -> str:
-    """Say in one line how it went."""
+    """Say in one line how it went, and whatever speaks against believing it."""
+    return " Doubtful: ".join([_outcome(result, series), *result.metrics["trust"]["doubts"]])
+
+
+def _outcome(result: RunResult, series: RunSeries) -> str:
     length = f"{result.length_m:,.0f} m"
     if "filter" not in series.errors:
         return f"{length} tracked; there is no ground truth, so the errors are not known."

@@ -53,7 +53,7 @@ def config_text(sequence_name: str, matcher_name: str, settings: TrackSettings) 
     """The content of a run's `config.yaml`."""
     content = asdict(settings)
     if content["start"] is not None:
-        content["start"] = list(content["start"])
+        content["start"] = [float(value) for value in content["start"]]  # numpy's would not be written
     return yaml.safe_dump({"sequence": sequence_name, "matcher": matcher_name, **content}, sort_keys=False)
 
 

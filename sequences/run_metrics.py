@@ -14,6 +14,7 @@ from sequences.metrics import after_first_quarter, correlation_length, drift, su
 from sequences.run_result import RunResult
 from sequences.sequence import odometry_is_emulated
 from sequences.start import prior_answers
+from sequences.trust import trust
 
 TIMING_KEYS = ("seconds_per_frame", "realtime_factor")
 """The only entries that differ between two runs with the same seed."""
@@ -34,7 +35,8 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
     The methods `prior`, `odometry`, `single_shot` (measured frames only), `filter`, `filter_after_first_quarter` (of
     the way) and `smoother`, as `metrics.summarise` describes them, `drift`, and `single_shot_correlation_length_m`,
     None where too few scans were matched to say; none of these without ground truth.
-    Always: what was run, and `seconds_per_frame` by stage, averaged over all frames.
+    Always: what was run, whether to believe it (`sequences.trust`), and `seconds_per_frame` by stage, averaged over all
+    frames.
     """
     methods = {} if result.truth is None else _methods(result, result.truth)
     rows = result.frame_rows
@@ -58,6 +60,7 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
         "skipped_frames": sum(bool(row.skipped_reason) for row in rows),
         "odometry_calibration": asdict(result.odometry_calibration),
         "filter_calibration": asdict(result.filter_calibration),
+        "trust": asdict(trust(rows, result.odometry_calibration)),
         **methods,
         "seconds_per_frame": {stage: value / len(rows) for stage, value in seconds.items()},
         "realtime_factor": duration / processing,

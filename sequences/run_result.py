@@ -66,7 +66,7 @@ class Snapshot:
     Attributes
     ----------
     index
-        Number of the frame in the run: its place in `RunResult.stamps_ns`.
+        Index of the scan in the sequence, as in `FrameRow`.
     bev
         (C, H, W) float32, the scan from above: body x along columns, body y against rows.
     map_crop

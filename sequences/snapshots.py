@@ -24,7 +24,7 @@ def take_snapshot(
     Parameters
     ----------
     index
-        Number of the frame in the run.
+        Of the scan in the sequence.
     measurement
         The frame's measurement.
     map_raster, ground_z

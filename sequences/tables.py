@@ -95,6 +95,7 @@ def closing_lines(metrics: dict[str, Any]) -> list[str]:
     if metrics["odometry_emulated"]:
         lines.append("odometry emulated: the truth with drift added")
     lines.append(f"{metrics['realtime_factor']:.2g} times real time")
+    lines += [f"doubtful: {doubt}" for doubt in metrics.get("trust", {}).get("doubts", ())]
     return lines
 
 

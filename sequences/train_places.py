@@ -7,6 +7,7 @@ often an unseen scan finds its own place among those of all unseen scans.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -34,6 +35,7 @@ _HEADINGS = 72
 _JITTER_M = 3.0
 """Places of an index are metres apart, and a scan is taken between them."""
 _VALIDATION_STREAM = 1
+_STRIDE = 4  # neighbours in an area are of one street, often
 
 Progress = Callable[[int, int], None]
 
@@ -176,7 +178,8 @@ def _displaced(source: SimulatedSamples, scans_per_area: int, seed: int) -> Iter
         for area in range(source.areas):
             samples = source.area(area)
             offset = np.random.default_rng((seed, turn, area)).uniform(-_JITTER_M, _JITTER_M, 2)
-            yield samples[(4 * turn + area) % len(samples)], offset
+            before_repeating = len(samples) // math.gcd(len(samples), _STRIDE)
+            yield samples[(_STRIDE * turn + turn // before_repeating + area) % len(samples)], offset
 
 
 def _write(embedding: PlaceEmbedding, facts: dict[str, Any], out: Path) -> None:

@@ -24,6 +24,7 @@ from fusion.trajectory import Trajectory
 from learned.map_raster import MapRaster
 from learned.matcher import SearchRegion
 from sequences.drive import load_drive
+from sequences.figures import frames_figure, series_of
 from sequences.folder import FolderSequence
 from sequences.localize import track
 from sequences.measurement import Measurement
@@ -216,6 +217,10 @@ def test_odometry_that_covers_a_part_tracks_that_part(made_drive: MadeDrive) -> 
     assert [row.index for row in result.frame_rows] == list(range(5, 25))
     assert result.metrics["filter"]["position_error_m"]["mean"] < 1.0
     assert any("10 frames left out" in line for line in result.log)
+    assert len(result.snapshots) > 0
+    write_run(result, made_drive.path / "run")  # whose pictures show the frames by the numbers of their scans
+    figure = frames_figure(result, series_of(result))
+    assert figure.axes[0].get_title() == "frame 5, 0 m"
 
 
 def test_an_unknown_heading_is_found(made_drive: MadeDrive) -> None:

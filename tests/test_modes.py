@@ -217,3 +217,10 @@ def test_tempering_brings_separate_components_closer_by_the_power() -> None:
     np.testing.assert_allclose(np.diff(flat.log_density(means)), np.diff(mixture.log_density(means)) / 3.0, atol=1e-9)
     with pytest.raises(SkyfixError, match="temperature"):
         mixture.tempered(0.0)
+
+
+def test_covariances_that_are_not_symmetric_are_refused():
+    lopsided = np.array([[1.0, 0.9, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    for covariance in (lopsided, lopsided.T):
+        with pytest.raises(SkyfixError, match="expected symmetric matrices"):
+            GaussianMixture(np.ones(1), np.zeros((1, 3)), covariance[None])

@@ -104,6 +104,28 @@ def test_a_folder_may_hold_them_instead(form: tuple[str, Write], made_drive: Mad
         FolderSequence(made_drive.path)
 
 
+def test_missing_returns_of_a_bin_are_left_out_and_other_numbers_refused(tmp_path: Path) -> None:
+    missing = np.insert(POINTS.astype(np.float32), 1, [np.nan, np.nan, np.nan, 0.0], axis=0)
+    missing.tofile(tmp_path / "a.bin")
+    np.testing.assert_array_equal(read_points(tmp_path / "a.bin"), POINTS.astype(np.float32))
+    for wrong in (np.where(np.arange(4) == 1, np.nan, POINTS), POINTS * [np.inf, 1.0, 1.0, 1.0]):
+        wrong.astype(np.float32).tofile(tmp_path / "a.bin")
+        with pytest.raises(ScanError, match="expected finite points"):
+            read_points(tmp_path / "a.bin")
+    np.full((3, 4), np.nan, np.float32).tofile(tmp_path / "a.bin")
+    with pytest.raises(ScanError, match="expected points, got none"):
+        read_points(tmp_path / "a.bin")
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".npy"])
+def test_coordinates_that_cannot_be_metres_are_refused(tmp_path: Path, suffix: str) -> None:
+    millimetres = (np.array([[25.0, 1.0, 0.0, 0.5]]) * [1e3, 1e3, 1e3, 1.0]).astype(np.float32)
+    write = {".bin": millimetres.tofile, ".npy": lambda path: np.save(path, millimetres)}[suffix]
+    write(tmp_path / f"a{suffix}")
+    with pytest.raises(ScanError, match=r"expected metres about the sensor.*2\.5e\+04"):
+        read_points(tmp_path / f"a{suffix}")
+
+
 def test_a_folder_of_two_formats_is_refused(made_drive: MadeDrive) -> None:
     np.save(made_drive.path / "scans" / "000030.npy", POINTS)
     with pytest.raises(SkyfixError, match=r"scans: expected files of one format, got \.bin and \.npy"):

@@ -165,3 +165,16 @@ def test_what_does_not_fit_is_one_line_before_anything_is_simulated(
         train_embedding(config, tmp_path, tmp_path / "file" / "a.safetensors", options)
     with pytest.raises(SkyfixError, match="--scans-per-area: expected 1 or more, got 0"):
         PlaceOptions(scans_per_area=0)
+
+
+@pytest.mark.parametrize("of_area", [1, 4, 6, 7, 8, 16])
+def test_an_area_shows_all_its_samples_before_one_is_shown_again(of_area: int) -> None:
+    class Source:
+        areas = 3
+
+        def area(self, number: int) -> list[tuple[int, int]]:
+            return [(number, index) for index in range(of_area)]
+
+    shown = [sample for sample, _ in sequences.train_places._displaced(Source(), 2 * of_area, 0)]  # type: ignore[arg-type]
+    assert len(set(shown[: 3 * of_area])) == len(set(shown)) == 3 * of_area
+    assert set(shown[3 * of_area :]) == set(shown)
