@@ -36,12 +36,12 @@ class GaussianMixture:
     covariances: FloatArray
 
     def __post_init__(self) -> None:
-        weights = checked("mixture weights", self.weights, ("M",))
+        weights = checked("mixture weights", self.weights, ("M",)).copy()
         if len(weights) == 0 or weights.min() <= 0.0 or weights.sum() > 1.0 + 1e-6:
             raise SkyfixError(f"mixture weights: expected positive with a sum <= 1, got {weights}")
         means = checked("mixture means", self.means, (len(weights), 3)).copy()
         means[:, 2] = se2.wrap(means[:, 2])
-        covariances = checked("mixture covariances", self.covariances, (len(weights), 3, 3))
+        covariances = checked("mixture covariances", self.covariances, (len(weights), 3, 3)).copy()
         if not np.allclose(covariances, covariances.swapaxes(1, 2), rtol=1e-6, atol=1e-12):
             raise SkyfixError("mixture covariances: expected symmetric matrices, got one that is not")
         if np.linalg.eigvalsh(covariances).min() <= 0.0:

@@ -83,7 +83,8 @@ class LikelihoodVolume:
     ----------
     log_prob : (rows, cols, K) float32
         ln density per m^2 rad at the cell centres, normalised: ``sum(exp(log_prob)) * cell_volume == 1``. Yaw bin k
-        is centred at ``2 pi k / K``. Cells at `floor` or below were not evaluated.
+        is centred at ``2 pi k / K``. Cells at `floor` or below were not evaluated. A C-contiguous array is taken over
+        and not copied: do not write to it afterwards.
     grid : MapGrid
         Where the cells lie.
     floor : float

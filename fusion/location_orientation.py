@@ -27,7 +27,8 @@ class LocationOrientationMaps:
     Parameters
     ----------
     location : (rows, cols) float32
-        ln density per m^2, ``sum(exp(location)) * pixel_area == 1``.
+        ln density per m^2, ``sum(exp(location)) * pixel_area == 1``. Like `orientation` it is taken over, not copied:
+        do not write to it afterwards.
     orientation : (K, rows, cols) float32
         ln density per rad at each position, ``sum over K of exp(orientation) * 2 pi / K == 1``; bin k is centred at
         ``2 pi k / K``.

@@ -101,6 +101,8 @@ class OdometryNoise:
         """Covariances (N, 3, 3) of the increments `deltas` (N, 3) that took `seconds` (N,)."""
         deltas = checked("deltas", deltas, ("N", 3))
         seconds = checked("seconds", seconds, (len(deltas),))
+        if (seconds < 0.0).any():
+            raise SkyfixError(f"seconds: expected zero or more, got {seconds.min():g}")
         distance = np.hypot(deltas[:, 0], deltas[:, 1])
         heading = self.heading_rad_per_sqrt_m**2 * distance + self.heading_rad_per_sqrt_s**2 * seconds
         heading += self.heading_rad_per_sqrt_rad**2 * np.abs(deltas[:, 2])

@@ -16,11 +16,13 @@ def checked_stamps(stamps_ns: ArrayLike) -> IntArray:
     Raises
     ------
     SkyfixError
-        When they are not integers in one axis: float seconds must be converted where they are read.
+        When they are not integers of 64 bits in one axis: float seconds must be converted where they are read.
     """
     stamps = np.asarray(stamps_ns)
     if stamps.ndim != 1 or not (np.issubdtype(stamps.dtype, np.integer) or stamps.size == 0):
         raise SkyfixError(f"stamps: expected (N,) int64 nanoseconds, got {stamps.shape} {stamps.dtype}")
+    if stamps.size and int(stamps.max()) > np.iinfo(np.int64).max:
+        raise SkyfixError(f"stamps: expected int64 nanoseconds, got {stamps.max()}")
     return stamps.astype(np.int64)
 
 

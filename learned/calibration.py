@@ -70,6 +70,9 @@ class Calibration:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise SkyfixError(f"calibration {name}: expected above zero, got {value}")
+        for name in ("confidence_slope", "confidence_intercept"):
+            if not math.isfinite(getattr(self, name)):
+                raise SkyfixError(f"calibration {name}: expected a number, got {getattr(self, name)}")
 
     def correlation_length_on(self, map_raster: MapRaster) -> float:
         """Distance over which errors decorrelate on this map, metres."""

@@ -10,6 +10,7 @@ whole map answers always (Radovanovic et al., "Hubs in space", JMLR 2010).
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import asdict, dataclass, field
 from importlib import resources
@@ -61,6 +62,16 @@ class PlaceEmbedding:
                 raise SkyfixError(f"place embedding: expected {name} {shape}, got {tuple(getattr(self, name).shape)}")
         if orders != self.harmonics.orders + 1:
             raise SkyfixError(f"place embedding: expected {self.harmonics.orders + 1} orders, got {orders}")
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the network's weights and these, as they are kept on disk."""
+        digest = hashlib.sha256(self.network.encode())
+        for name in _COMPLEX:
+            digest.update(torch.view_as_real(getattr(self, name)).half().contiguous().numpy().tobytes())
+        for mean in (self.scan_mean, self.map_mean):
+            digest.update(mean.half().numpy().tobytes())
+        return digest.hexdigest()
 
     def of_scans(self, harmonics: Tensor) -> Tensor:
         """Embeddings (B, M + 1, D) of scans' harmonics (B, F, M + 1); of norm 1."""

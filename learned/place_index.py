@@ -110,7 +110,7 @@ class PlaceIndex:
     temperature
         What votes are divided by to be nats.
     fingerprint
-        Of the weights of the network that made it.
+        Of the weights of the network and the embedding that made it.
     map_digest
         Of the map.
     coarse

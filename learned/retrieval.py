@@ -124,7 +124,7 @@ class Retriever:
             self._cell_m,
             round(settings.tile_m / settings.step_m),
             self._temperature,
-            self._embedding.network,
+            self._embedding.fingerprint,
             map_digest(map_raster),
         )
 
@@ -138,11 +138,12 @@ class Retriever:
         Raises
         ------
         SkyfixError
-            If the index was made by other weights, or the scan or the height of its ground cannot be used.
+            If the index was made by other weights or another embedding, or the scan or the height of its ground cannot
+            be used.
         """
-        if index.fingerprint != self._embedding.network:
+        if index.fingerprint != (made_by := self._embedding.fingerprint):
             raise SkyfixError(
-                f"index: expected one of weights {self._embedding.network[:12]}, got one of {index.fingerprint[:12]}"
+                f"index: expected one of weights and embedding {made_by[:12]}, got one of {index.fingerprint[:12]}"
             )
         counts = bev_counts(points, ground_z, self._net.settings.bev)
         with torch.inference_mode():

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import se2
+from fusion.errors import SkyfixError
 from learned.bev import log_density
 from learned.map_raster import CLASS_INDEX, CLASSES, PALETTE
 
@@ -85,6 +86,18 @@ class Augmentation:
     rotate: float = 0.0
     rotate_deg: float = 60.0
     colour_jitter: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("drop_class", "thin", "shorten", "drop_sector", "drop_band", "rotate", "colour_jitter"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise SkyfixError(f"augmentation {name}: expected 0 to 1, got {getattr(self, name)}")
+        for name, largest in (("half_heading_deg", 180.0), ("rotate_deg", 180.0)):
+            if not 0.0 <= getattr(self, name) <= largest:
+                raise SkyfixError(f"augmentation {name}: expected 0 to {largest:g}, got {getattr(self, name)}")
+        if self.max_offset_px < 0 or self.crop_px < 1:
+            raise SkyfixError(
+                f"augmentation: expected max_offset_px >= 0 and crop_px >= 1, got {self.max_offset_px}, {self.crop_px}"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from fusion import se2
 from fusion.arrays import FloatArray
@@ -38,6 +37,7 @@ from learned.map_raster import MapRaster
 from sequences.emulated_odometry import emulate_odometry
 from sequences.map_source import read_json, read_number
 from sequences.odometry_files import OdometryFiles
+from sequences.picture import read_photograph
 from sequences.point_file import frame_number
 from sequences.sequence import SCAN_COLUMNS, ScanError, checked_points
 
@@ -134,11 +134,7 @@ def metres_per_pixel(size_px: int, height_m: float = CAMERA_HEIGHT_M) -> float:
 
 
 def _map(path: Path) -> MapRaster:
-    try:
-        with Image.open(path) as image:
-            picture = np.asarray(image.convert("RGB"))
-    except OSError as error:
-        raise SkyfixError(f"{path}: cannot be read: {error.strerror or 'not a readable image'}") from error
+    picture = read_photograph(path)
     size = picture.shape[0]
     if picture.shape[1] != size:
         raise SkyfixError(f"{path}: expected a square photograph, got {picture.shape[1]} x {size} px")

@@ -22,6 +22,7 @@ from PIL import Image
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from learned.map_raster import CLASS_INDEX, CLASSES, MapRaster
+from sequences.picture import read_indices, read_photograph
 
 MAP_FILE = "map.json"
 _TRANSPARENT = 255
@@ -83,12 +84,12 @@ def read_map(directory: Path) -> MapRaster:
     if class_layers:
         classes = np.zeros((grid.rows, grid.cols), dtype=np.uint8)
         for layer in sorted(class_layers, key=_painting_order):
-            _paint(classes, _read_png(directory, layer, grid, mode=None), layer)
+            _paint(classes, _read_png(directory, layer, grid), layer)
         return MapRaster.from_classes(grid, classes)
     images = [layer for layer in layers if layer.is_image]
     if not images:
         raise SkyfixError(f"{MAP_FILE}: expected a layer with classes or one of kind 'image', got neither")
-    picture = _read_png(directory, images[0], grid, mode="RGB")
+    picture = _read_png(directory, images[0], grid)
     return MapRaster(grid, None, picture)
 
 
@@ -200,17 +201,11 @@ def _layer(entry: Any) -> _Layer:
     return _Layer(str(entry.get("name", "")), entry["file"], class_names, is_image)
 
 
-def _read_png(directory: Path, layer: _Layer, grid: MapGrid, mode: str | None) -> NDArray[np.uint8]:
-    """Pixels of a layer: RGB, or (mode None) the indices of an 8-bit grey or palette image."""
+def _read_png(directory: Path, layer: _Layer, grid: MapGrid) -> NDArray[np.uint8]:
+    """Pixels of a layer: colours of a photograph, or the indices of an 8-bit grey or palette image."""
     path = directory / layer.file
-    try:
-        with Image.open(path) as image:
-            pixels = np.asarray(image.convert(mode) if mode else image)
-    except OSError as error:
-        raise SkyfixError(f"{path}: cannot be read: {error.strerror or 'not a readable image'}") from error
-    except Image.DecompressionBombError as error:
-        raise SkyfixError(f"{path}: {error}") from error
-    expected = (grid.rows, grid.cols) if mode is None else (grid.rows, grid.cols, 3)
+    pixels = read_photograph(path) if layer.is_image else read_indices(path)
+    expected = (grid.rows, grid.cols, 3) if layer.is_image else (grid.rows, grid.cols)
     if pixels.shape != expected or pixels.dtype != np.uint8:
         raise SkyfixError(f"{path.name}: expected {expected} uint8 (8-bit PNG), got {pixels.shape} {pixels.dtype}")
     return pixels

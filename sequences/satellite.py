@@ -6,11 +6,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
-from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from learned.map_raster import MapRaster
+from sequences.picture import read_photograph
 
 METRES_PER_PIXEL = 156543.03392 * math.cos(math.radians(49.015)) / 2**18 / 2
 """At the latitude that the protocol takes for all of KITTI: 0.1958 m."""
@@ -18,11 +17,7 @@ METRES_PER_PIXEL = 156543.03392 * math.cos(math.radians(49.015)) / 2**18 / 2
 
 def read_satellite_image(path: Path) -> MapRaster:
     """A picture without classes, its origin in the middle; `SkyfixError` when it cannot be read."""
-    try:
-        with Image.open(path) as image:
-            picture = np.asarray(image.convert("RGB"))
-    except OSError as error:
-        raise SkyfixError(f"{path}: cannot be read: {error.strerror or 'not a readable image'}") from error
+    picture = read_photograph(path)
     rows, cols = picture.shape[:2]
     corner = -0.5 * METRES_PER_PIXEL * np.array([cols, rows])
     return MapRaster(MapGrid(rows, cols, METRES_PER_PIXEL, float(corner[0]), float(corner[1])), None, picture)

@@ -112,6 +112,8 @@ def train_from_config(
         raise SkyfixError(f"averaged_shares: expected a --average for each of {count}, got {len(options.averaged)}")
     averaged = [load_network(path, architecture)[0].state_dict() for path in options.averaged]
     initial = None if options.initial is None else load_initial(options.initial, architecture)
+    if config.initial is not None and options.initial is None:
+        raise SkyfixError(f"config {config_path.name}: initial: expected --initial {config.initial}, got none")
     config = config.with_checkpoints(options.initial, options.averaged)
     make_folder(out_dir)
     cache_dir = options.cache_dir or out_dir / "cache"

@@ -18,7 +18,7 @@ from sequences.training_data import SimulationSettings
 
 RESOLVED_FILE = "config.yaml"
 _FAR_REACH_M = 72.0
-_FREE_KEYS = ("training.workers",)
+_FREE_KEYS = ("training.workers", "calibration_samples")
 
 
 class TrainConfig(BaseModel):
@@ -37,11 +37,11 @@ class TrainConfig(BaseModel):
     initial: str | None = None
     averaged: tuple[str, ...] = ()
     averaged_shares: tuple[Annotated[float, Field(gt=0.0, lt=1.0)], ...] = ()
-    extracts: dict[str, float]
+    extracts: dict[str, Annotated[float, Field(gt=0.0, allow_inf_nan=False)]]
     matching_half_extent_m: float | None = None
     validation_extract: str
-    validation_samples: int = 96
-    calibration_samples: int = 64
+    validation_samples: Annotated[int, Field(ge=1)] = 96
+    calibration_samples: Annotated[int, Field(ge=2)] = 64
     simulation: SimulationSettings = SimulationSettings()
     training: TrainingSettings = TrainingSettings()
 

@@ -8,10 +8,12 @@ once.
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +72,7 @@ class SimulationSettings:
     Raises
     ------
     SkyfixError
-        If a world or a sensor has no such property.
+        If a world or a sensor has no such property, or a number is out of range.
     """
 
     samples: int = 16000
@@ -90,6 +92,12 @@ class SimulationSettings:
     sensor: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name in ("samples", "samples_per_area", "area_half_extent_m", "scan_half_extent_m", "sample_px"):
+            if not getattr(self, name) > 0:
+                raise SkyfixError(f"simulation.{name}: expected above zero, got {getattr(self, name)}")
+        for name in ("overhead_share", "drivable_share", "overgrown_share"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise SkyfixError(f"simulation.{name}: expected 0 to 1, got {getattr(self, name)}")
         for name, given, kind in (("world", self.world, WorldStyle), ("sensor", self.sensor, LidarModel)):
             known = {each.name for each in fields(kind) if each.type == "float"}
             for key in given.keys() - known:
@@ -171,15 +179,8 @@ class SimulatedSamples:
     def area(self, number: int) -> list[Sample]:
         """All samples of an area, from the cache or made now."""
         path = self._path(number)
-        if path.exists():
-            with np.load(path) as data:
-                poses = data["poses"].tolist()
-                places = data["places"].tolist() if "places" in data else [UNKNOWN_PLACE] * len(poses)
-                columns = zip(data["counts"], data["classes"], poses, places, strict=True)
-                return [
-                    Sample(counts, classes, row, col, yaw, (x, y))
-                    for counts, classes, (row, col, yaw), (x, y) in columns
-                ]
+        if path.exists() and (cached := _read_samples(path)) is not None:
+            return cached
         samples = self._simulate(number)
         partial = path.with_suffix(f".{os.getpid()}.part.npz")
         np.savez_compressed(
@@ -238,6 +239,20 @@ class SimulatedSamples:
         bev = BevSettings(self.settings.bev_half_extent_m, ground=self.settings.ground)
         counts = bev_counts(scan, -model.mount_height_m, bev)
         return cut_sample(counts, classes, float(row), float(col), float(pose[2]), self.settings.sample_px)
+
+
+def _read_samples(path: Path) -> list[Sample] | None:
+    """The samples of a cached area; None when the file is damaged, and the area is to be made again."""
+    try:
+        with path.open("rb") as file, np.load(file) as data:
+            poses = data["poses"].tolist()
+            places = data["places"].tolist() if "places" in data else [UNKNOWN_PLACE] * len(poses)
+            columns = zip(data["counts"], data["classes"], poses, places, strict=True)
+            return [
+                Sample(counts, classes, row, col, yaw, (x, y)) for counts, classes, (row, col, yaw), (x, y) in columns
+            ]
+    except (OSError, EOFError, KeyError, ValueError, BadZipFile, zlib.error):
+        return None
 
 
 def _neighbourhood(features: MapFeatures, half_extent_m: float, rng: np.random.Generator) -> MapGrid:

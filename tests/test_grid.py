@@ -88,7 +88,9 @@ def test_offset_refuses_other_pixels():
         grid.offset_of(MapGrid(5, 5, 0.25, 0.0, 0.0))
 
 
-@pytest.mark.parametrize("bad", [(0, 5, 1.0, 0, 0), (5, 0, 1.0, 0, 0), (5, 5, 0.0, 0, 0), (5, 5, np.nan, 0, 0)])
+@pytest.mark.parametrize(
+    "bad", [(0, 5, 1.0, 0, 0), (5, 0, 1.0, 0, 0), (5, 5, 0.0, 0, 0), (5, 5, np.nan, 0, 0), (1.5, 2, 1.0, 0, 0)]
+)
 def test_impossible_grids_are_refused(bad):
     with pytest.raises(SkyfixError, match="grid"):
         MapGrid(*bad)

@@ -224,3 +224,12 @@ def test_covariances_that_are_not_symmetric_are_refused():
     for covariance in (lopsided, lopsided.T):
         with pytest.raises(SkyfixError, match="expected symmetric matrices"):
             GaussianMixture(np.ones(1), np.zeros((1, 3)), covariance[None])
+
+
+def test_a_mixture_keeps_what_it_was_given():
+    weights, covariance = np.ones(1), np.eye(3)[None]
+    made = GaussianMixture(weights, np.zeros((1, 3)), covariance)
+    weights *= 0.5
+    covariance *= 100.0
+    assert made.weights[0] == 1.0
+    np.testing.assert_array_equal(made.covariances[0], np.eye(3))

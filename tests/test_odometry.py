@@ -107,6 +107,7 @@ def test_bad_increments_are_refused():
         "semidefinite": lambda: increment(0, np.zeros(3), -np.eye(3)),
         "at least one": lambda: accumulate([]),
         "stamp after": lambda: accumulate([increment(5, np.zeros(3)), increment(5, np.zeros(3))]),
+        "seconds: expected zero or more, got -5": lambda: OdometryNoise().covariance(np.zeros(3), -5.0),
         "lateral": lambda: OdometryNoise(lateral_m_per_sqrt_m=-1.0),
         "expected stamps in": lambda: increments_at([0, 5 * SECOND], winding_drive(5), NOISE),
         "increasing": lambda: increments_at([1, 0], winding_drive(5), NOISE),

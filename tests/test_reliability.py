@@ -148,3 +148,5 @@ def test_everything_is_fitted_together() -> None:
         Calibration(temperature=0.0)
     with pytest.raises(SkyfixError, match="calibration bare_map_correlation_length_m: expected above zero, got -1"):
         Calibration(bare_map_correlation_length_m=-1.0)
+    with pytest.raises(SkyfixError, match="calibration confidence_slope: expected a number, got nan"):
+        Calibration(confidence_slope=math.nan)

@@ -53,8 +53,12 @@ def test_bad_input_is_one_line(matcher: RotMatch, index: PlaceIndex, tmp_path: P
         TileSettings(step_m=7.0)
     with pytest.raises(SkyfixError, match="tiles: expected a step_m of a multiple of 2 m, got 1 m"):
         Retriever(matcher, embedding_of(matcher)).build(town(), TileSettings(step_m=1.0))
-    with pytest.raises(SkyfixError, match="index: expected one of weights"):
+    with pytest.raises(SkyfixError, match="index: expected one of weights and embedding"):
         Retriever(matcher, embedding_of(matcher)).query(replace(index, fingerprint="others"), made_points(), -1.7)
+    mine = embedding_of(matcher)
+    retrained = replace(mine, map_weights=2.0 * mine.map_weights)
+    with pytest.raises(SkyfixError, match="index: expected one of weights and embedding"):
+        Retriever(matcher, retrained).query(index, made_points(), -1.7)
     torch.manual_seed(9)
     other = RotMatch(RotMatchNet(RotMatchSettings(4, (4, 4, 8, 8), BevSettings(20.0))))
     with pytest.raises(SkyfixError, match="place embedding: expected one of the features of weights"):

@@ -22,7 +22,7 @@ from sequences.lidar import LidarModel, simulate_scan
 from sequences.osm import Line, MapFeatures, read_osm
 from sequences.train_budget import steps_within
 from sequences.train_command import TrainOptions, train_from_config
-from sequences.train_config import TrainConfig, read_config
+from sequences.train_config import TrainConfig, first_difference, read_config
 from sequences.training_data import SimulatedSamples, SimulationSettings
 from sequences.world import build_area
 from sequences.world_style import WorldStyle
@@ -224,10 +224,33 @@ def test_overrides_are_typed_and_checked(tiny: Path) -> None:
         ("simulation.ground=plane", "expected surface as training.network.bev, got plane"),
         ("simulation.world={slopes: 0.0}", r"simulation\.world: expected one of .*slope.*, got slopes"),
         ("simulation.sensor={azimuths: 100}", r"simulation\.sensor: expected one of .*tilt_noise_deg.*, got azimuths"),
+        ("simulation.samples=-4", r"simulation\.samples: expected above zero, got -4"),
+        ("simulation.overhead_share=1.5", r"simulation\.overhead_share: expected 0 to 1, got 1\.5"),
+        ("training.augmentation.rotate=7", "augmentation rotate: expected 0 to 1, got 7"),
+        ("training.augmentation.thin=.nan", "augmentation thin: expected 0 to 1, got nan"),
+        ("training.augmentation.half_heading_deg=-5", "augmentation half_heading_deg: expected 0 to 180, got -5"),
+        ("training.augmentation.max_offset_px=-3", "augmentation: expected max_offset_px >= 0 .* got -3, 256"),
+        ("calibration_samples=1", "calibration_samples: .*greater than or equal to 2"),
+        ("validation_samples=0", "validation_samples: .*greater than or equal to 1"),
+        ("extracts={a: 0.0}", r"extracts\.a: .*greater than 0"),
     ):
         with pytest.raises(SkyfixError, match=message) as caught:
             read_config(tiny, [override])
         assert "\n" not in str(caught.value)
+
+
+def test_a_training_can_be_calibrated_on_more_samples_afterwards(tiny: Path) -> None:
+    few, many = read_config(tiny, ["calibration_samples=2"]), read_config(tiny, ["calibration_samples=9"])
+    assert first_difference(few, many) is None
+    assert first_difference(few, read_config(tiny, ["training.seed=9"])) is not None
+
+
+def test_a_configuration_that_went_on_from_a_checkpoint_asks_for_it_again(tiny: Path, tmp_path: Path) -> None:
+    with pytest.raises(SkyfixError, match=r"initial: expected --initial near\.safetensors sha256:12, got none"):
+        train_from_config(
+            tiny, tmp_path, tmp_path / "out", options=TrainOptions(("initial=near.safetensors sha256:12",))
+        )
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_shipped_weights_configuration_is_still_one() -> None:
@@ -306,3 +329,9 @@ def test_samples_depend_on_seed_and_number_alone(tmp_path: Path) -> None:
         assert 80 <= made.col <= 256
     order = first.order(np.random.default_rng(0))
     np.testing.assert_array_equal(np.sort(order), np.arange(4))
+    area = tmp_path / "a" / "area_00000.npz"
+    for damaged in (b"", area.read_bytes()[:5000], b"nothing"):  # made again
+        area.write_bytes(damaged)
+        again = SimulatedSamples(extracts, settings, tmp_path / "a")[0]
+        np.testing.assert_array_equal(again.counts, second[0].counts)
+        assert area.stat().st_size > 5000

@@ -111,3 +111,8 @@ def test_prior_knows_its_edges():
     for half, heading in ((0.0, 0.1), (1.0, 0.0), (1.0, 4.0), (np.nan, 0.1)):
         with pytest.raises(SkyfixError, match="prior"):
             UniformPrior(np.zeros(3), half, heading)
+
+
+def test_stamps_beyond_64_bits_are_refused():
+    with pytest.raises(SkyfixError, match="stamps: expected int64 nanoseconds, got 9223372036854775817"):
+        Trajectory(np.array([2**63 + 5, 2**63 + 9], dtype=np.uint64), np.zeros((2, 3)))
