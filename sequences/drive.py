@@ -14,6 +14,7 @@ from fusion.trajectory import Trajectory
 from sequences.sequence import Sequence
 from sequences.trajectory_io import format_seconds
 
+_LONGEST_STEP_S = 600.0  # between two scans or two odometry poses, in the middle of all
 STAMP_TOLERANCE_NS = 1_000_000
 """Files round their seconds: a scan up to 1 ms outside a trajectory's span takes its end pose."""
 
@@ -56,11 +57,14 @@ def load_drive(sequence: Sequence, odometry_name: str) -> Drive:
     Raises
     ------
     SkyfixError
-        If the odometry is unknown or unreadable, or it or the truth leaves fewer than two of the scans covered.
+        If the odometry is unknown or unreadable, times are in another unit, or it or the truth leaves fewer than two of
+        the scans covered.
     """
     odometry = sequence.odometry(odometry_name)
     truth = sequence.ground_truth
     stamps = sequence.stamps_ns
+    _check_seconds(stamps, "scans")
+    _check_seconds(odometry.stamp_ns, f"odometry {odometry_name!r}")
     covered = _covered(stamps, odometry, f"odometry {odometry_name!r}")
     if truth is not None:
         covered &= _covered(stamps, truth, "ground truth")
@@ -80,6 +84,13 @@ def place_odometry(drive: Drive, start: FloatArray) -> Trajectory:
     """The odometry alone, in the map frame, begun at `start` (3,)."""
     moved = se2.between(drive.odometry.poses[:1], drive.odometry.poses)
     return Trajectory(drive.stamps_ns, se2.compose(start[None], moved), None, "map")
+
+
+def _check_seconds(stamps: NDArray[np.int64], label: str) -> None:
+    """Refuse what has been read as seconds and was nanoseconds, or the like: a file read so still has an order."""
+    step_s = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.0
+    if step_s > _LONGEST_STEP_S:
+        raise SkyfixError(f"{label}: expected times in seconds, got steps of {step_s:.3g}")
 
 
 def _covered(stamps: NDArray[np.int64], trajectory: Trajectory, label: str) -> NDArray[np.bool_]:

@@ -130,7 +130,7 @@ def read_osm(path: Path | str, origin_lat_lon: tuple[float, float] | None = None
         If the file is missing, unreadable or has no features.
     """
     if not Path(path).is_file():
-        raise SkyfixError(f"map extract: expected a .osm, .osm.gz or .osm.pbf file, got {path}")
+        raise SkyfixError(f"map extract: expected a .osm, .osm.gz or .osm.pbf file at {path}, got no such file")
     areas: list[tuple[dict[str, str], list[list[tuple[float, float]]]]] = []
     ways: list[tuple[dict[str, str], list[tuple[float, float]]]] = []
     points: list[tuple[str, tuple[float, float]]] = []

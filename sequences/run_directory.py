@@ -33,7 +33,7 @@ from sequences.run_result import FrameRow, RunResult
 from sequences.trajectory_io import format_seconds, write_tum
 
 
-def write_run(result: RunResult, out_dir: Path, overwrite: bool = False) -> Path:
+def write_run(result: RunResult, out_dir: Path | str, overwrite: bool = False) -> Path:
     """Write a run directory.
 
     Parameters
@@ -54,6 +54,7 @@ def write_run(result: RunResult, out_dir: Path, overwrite: bool = False) -> Path
     SkyfixError
         If the target is taken or cannot be written. Nothing is left behind then.
     """
+    out_dir = Path(out_dir)
     check_target(out_dir, overwrite)
     try:
         out_dir.parent.mkdir(parents=True, exist_ok=True)

@@ -22,6 +22,7 @@ from fusion.trajectory import Trajectory
 from sequences.odometry_axes import on_the_ground
 
 _NS_PER_S = 1_000_000_000
+_LATEST_NS = 2**63 - 1
 _TUM_COLUMNS = 8
 
 
@@ -113,6 +114,9 @@ def rising_stamp(field: str, path: Path, number: int, earlier: list[int], unit: 
     """Nanoseconds of a field, which have to be more than the last of the earlier ones; `SkyfixError` otherwise."""
     finite_number(field, path, number)
     stamp = int((Decimal(field) * (_NS_PER_S if unit == "s" else 1)).to_integral_value())
+    if abs(stamp) > _LATEST_NS:
+        expected = "seconds up to 9.2e9, not nanoseconds" if unit == "s" else "nanoseconds of 64 bits"
+        raise SkyfixError(f"{path.name}: line {number}: expected {expected}, got {field}")
     if earlier and stamp <= earlier[-1]:
         before = format_seconds(earlier[-1]) if unit == "s" else earlier[-1]
         raise SkyfixError(f"{path.name}: line {number}: stamps must increase, got {field} {unit} after {before} {unit}")

@@ -19,6 +19,7 @@ from sequences.run_result import FrameRow
 LEAST_GAIN_NATS = 3.0
 _LOST = 0.5
 _USUAL_LOG_SCALE, _USUAL_NOISE = 0.1, 5.0
+_FEW, _MANY = 2, 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,7 @@ class Trust:
 def trust(rows: Sequence[FrameRow], calibration: OdometryCalibration) -> Trust:
     """Judge a run by its frames, of which the first is always measured, and by what it found of its odometry."""
     gain = float(np.median([_gain_nats(row) for row in rows if row.log_evidence is not None]))
+    measured = sum(row.measured for row in rows)
     lost = [row.lost_score > _LOST for row in rows]
     doubts: list[str] = []
     if gain < LEAST_GAIN_NATS:
@@ -51,6 +53,8 @@ def trust(rows: Sequence[FrameRow], calibration: OdometryCalibration) -> Trust:
             f"{LEAST_GAIN_NATS:g} or more is usual): is it the right map and start, are the scans' axes and units "
             "right, does the map show buildings?"
         )
+    if measured < _FEW and len(rows) >= _MANY:
+        doubts.append(f"only {measured} of {len(rows)} scans were matched: does the odometry move, and in metres?")
     if any(lost):
         ending = ", at the end too" if lost[-1] else ""
         doubts.append(f"lost for {sum(lost)} of {len(lost)} frames{ending}: poses until it was found may be far off")

@@ -218,9 +218,36 @@ def test_odometry_that_covers_a_part_tracks_that_part(made_drive: MadeDrive) -> 
     assert result.metrics["filter"]["position_error_m"]["mean"] < 1.0
     assert any("10 frames left out" in line for line in result.log)
     assert len(result.snapshots) > 0
-    write_run(result, made_drive.path / "run")  # whose pictures show the frames by the numbers of their scans
+    write_run(result, str(made_drive.path / "run"))  # whose pictures show the frames by the numbers of their scans
     figure = frames_figure(result, series_of(result))
     assert figure.axes[0].get_title() == "frame 5, 0 m"
+
+
+def test_times_in_another_unit_are_refused(made_drive: MadeDrive) -> None:
+    def in_nanoseconds(path: Path) -> None:
+        lines = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
+        first = float(lines[0][0])
+        path.write_text(
+            "\n".join(" ".join([f"{(float(time) - first) * 1e9:.0f}", *rest]) for time, *rest in lines) + "\n"
+        )
+
+    in_nanoseconds(made_drive.path / "odometry" / "wheels.tum")
+    with pytest.raises(SkyfixError, match="odometry 'wheels': expected times in seconds, got steps of"):
+        run(made_drive)
+    in_nanoseconds(made_drive.path / "scans" / "times.txt")
+    with pytest.raises(SkyfixError, match="scans: expected times in seconds, got steps of"):
+        run(made_drive)
+
+
+def test_a_matcher_that_answers_with_anything_else_is_told(made_drive: MadeDrive) -> None:
+    class Silent(EmulatedMatcher):
+        def match(self, *asked: Any) -> Any:
+            super().match(*asked)
+
+    with pytest.raises(
+        SkyfixError, match=r"matcher: expected match\(\) to answer with a LikelihoodVolume, got NoneType"
+    ):
+        track(FolderSequence(made_drive.path), Silent(made_drive.truth.poses), SETTINGS)
 
 
 def test_an_unknown_heading_is_found(made_drive: MadeDrive) -> None:

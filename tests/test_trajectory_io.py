@@ -111,3 +111,11 @@ def test_times_are_read_one_a_line(tmp_path: Path) -> None:
     (tmp_path / "times.txt").write_text("0.1 0.2\n")
     with pytest.raises(SkyfixError, match="expected one number"):
         read_times(tmp_path / "times.txt")
+
+
+def test_nanoseconds_where_seconds_belong_are_told(tmp_path: Path) -> None:
+    (tmp_path / "epoch.tum").write_text("1700000000000000000 0 0 0 0 0 0 1\n")
+    (tmp_path / "times.txt").write_text("1700000000000000000\n")
+    for read, name in ((read_tum, "epoch.tum"), (read_times, "times.txt")):
+        with pytest.raises(SkyfixError, match=f"{name}: line 1: expected seconds up to 9.2e9, not nanoseconds, got 17"):
+            read(tmp_path / name)
