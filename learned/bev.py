@@ -43,6 +43,11 @@ class BevSettings:
         if self.ground not in get_args(GroundModel):
             expected = " or ".join(get_args(GroundModel))
             raise SkyfixError(f"bird's-eye view: expected a ground of {expected}, got {self.ground!r}")
+        if not 0.0 < self.metres_per_pixel <= self.half_extent_m < math.inf:
+            raise SkyfixError(
+                f"bird's-eye view: expected a half_extent_m of at least a pixel, got {self.half_extent_m} m with "
+                f"{self.metres_per_pixel} m a pixel"
+            )
 
     @property
     def size(self) -> int:

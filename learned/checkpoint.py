@@ -61,7 +61,10 @@ def load_network(path: Path, architecture: Architecture) -> tuple[Any, Calibrati
         weights = load_file(path)
     except (KeyError, TypeError, SafetensorError) as error:
         raise SkyfixError(f"checkpoint {path.name}: expected a readable checkpoint, got {error!r}") from error
-    net = architecture.build(settings)
+    try:
+        net = architecture.build(settings)
+    except (ValueError, RuntimeError, TypeError, ArithmeticError) as error:  # what torch makes of impossible sizes
+        raise SkyfixError(f"checkpoint {path.name}: its settings make no network: {error}") from error
     try:
         net.load_state_dict(weights)
     except RuntimeError as error:
@@ -114,7 +117,7 @@ def load_checkpoint(path: Path) -> NetworkMatcher:
     """
     from learned.architectures import ARCHITECTURES
 
-    tag = _facts(path).get("architecture")
+    tag = str(_facts(path).get("architecture"))
     by_tag = {architecture.tag: architecture for architecture in ARCHITECTURES.values()}
     if tag not in by_tag:
         raise SkyfixError(f"checkpoint {path.name}: expected architecture {' or '.join(by_tag)}, got {tag}")

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -199,7 +200,7 @@ def _load(path: Path, key: str | None) -> NDArray[Any]:
                 wanted = "one array or a key" if key is None else f"an array {key!r}"
                 raise SkyfixError(f"{path.name}: expected {wanted}, got {', '.join(names) or 'no arrays'}")
             return np.asarray(content[chosen])
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SkyfixError(f"{path.name}: expected a readable .npy or .npz of numbers, got: {reason}") from error
 

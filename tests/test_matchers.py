@@ -137,6 +137,12 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
         (lambda facts: facts.update(architecture="other-2"), "expected architecture rotmatch-1, got other-2"),
         (lambda facts: facts["settings"].update(channels=6), "weights do not fit"),
         (lambda facts: facts.pop("calibration"), "expected a readable checkpoint"),
+        (lambda facts: facts["calibration"].update(confidence_slope="steep"), "expected a readable checkpoint"),
+        (lambda facts: facts["settings"].update(channels=-8), r"checkpoint net\.safetensors: "),
+        (
+            lambda facts: facts["settings"]["bev"].update(half_extent_m=0),
+            r"half_extent_m of at least a pixel, got 0\.0 m",
+        ),
     ],
 )
 def test_checkpoints_that_do_not_match_the_code_are_refused(tmp_path: Path, change, message: str) -> None:
@@ -148,6 +154,15 @@ def test_checkpoints_that_do_not_match_the_code_are_refused(tmp_path: Path, chan
     with pytest.raises(SkyfixError, match=message) as caught:
         RotMatch.load(path)
     assert "\n" not in str(caught.value)
+
+
+def test_an_architecture_that_is_no_name_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "net.safetensors"
+    RotMatch(RotMatchNet(SMALL)).save(path, {})
+    facts = json.loads(path.with_suffix(".json").read_text())
+    path.with_suffix(".json").write_text(json.dumps({**facts, "architecture": ["rotmatch-1"]}))
+    with pytest.raises(SkyfixError, match=r"expected architecture .*rotmatch-1.*, got \['rotmatch-1'\]"):
+        load_matcher(str(path))
 
 
 def test_unknown_matchers_are_named() -> None:
