@@ -92,7 +92,9 @@ class SimulationSettings:
     sensor: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("samples", "samples_per_area", "area_half_extent_m", "scan_half_extent_m", "sample_px"):
+        if self.samples < 0:
+            raise SkyfixError(f"simulation.samples: expected zero or more, got {self.samples}")
+        for name in ("samples_per_area", "area_half_extent_m", "scan_half_extent_m", "sample_px"):
             if not getattr(self, name) > 0:
                 raise SkyfixError(f"simulation.{name}: expected above zero, got {getattr(self, name)}")
         for name in ("overhead_share", "drivable_share", "overgrown_share"):

@@ -224,7 +224,7 @@ def test_overrides_are_typed_and_checked(tiny: Path) -> None:
         ("simulation.ground=plane", "expected surface as training.network.bev, got plane"),
         ("simulation.world={slopes: 0.0}", r"simulation\.world: expected one of .*slope.*, got slopes"),
         ("simulation.sensor={azimuths: 100}", r"simulation\.sensor: expected one of .*tilt_noise_deg.*, got azimuths"),
-        ("simulation.samples=-4", r"simulation\.samples: expected above zero, got -4"),
+        ("simulation.samples=-4", r"simulation\.samples: expected zero or more, got -4"),
         ("simulation.overhead_share=1.5", r"simulation\.overhead_share: expected 0 to 1, got 1\.5"),
         ("training.augmentation.rotate=7", "augmentation rotate: expected 0 to 1, got 7"),
         ("training.augmentation.thin=.nan", "augmentation thin: expected 0 to 1, got nan"),
