@@ -17,7 +17,7 @@ from learned.map_raster import MapRaster
 
 SCAN_COLUMNS = 4
 """x, y, z (metres, body frame: x forward, y left, z up) and reflectance (0..1)."""
-_FARTHEST_M = 10_000.0  # no LiDAR sees so far: millimetres, or numbers of another type
+_FARTHEST_M, _STRAYS = 10_000.0, 0.01  # no LiDAR sees so far: millimetres, or numbers of another type
 
 
 class ScanError(SkyfixError):
@@ -78,9 +78,11 @@ def checked_points(points: NDArray[np.float32], label: str) -> NDArray[np.float3
     bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
     if bad:
         raise ScanError(f"{label}: expected finite points, got {bad} of {len(points)} with NaN or infinity")
-    farthest = float(np.abs(points[:, :3]).max())
-    if farthest > _FARTHEST_M:
-        raise ScanError(f"{label}: expected metres about the sensor, float32, got coordinates up to {farthest:.3g}")
+    farthest = np.abs(points[:, :3]).max(axis=1)
+    if np.mean(farthest > _FARTHEST_M) > _STRAYS:
+        raise ScanError(
+            f"{label}: expected metres about the sensor, float32, got coordinates up to {farthest.max():.3g}"
+        )
     return points
 
 

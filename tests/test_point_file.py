@@ -122,6 +122,10 @@ def test_coordinates_that_cannot_be_metres_are_refused(tmp_path: Path, suffix: s
     millimetres = (np.array([[25.0, 1.0, 0.0, 0.5]]) * [1e3, 1e3, 1e3, 1.0]).astype(np.float32)
     write = {".bin": millimetres.tofile, ".npy": lambda path: np.save(path, millimetres)}[suffix]
     write(tmp_path / f"a{suffix}")
+    strays = np.repeat(POINTS[:1], 1000, axis=0).astype(np.float32)
+    strays[3, 0] = 65_535.0
+    strays.tofile(tmp_path / "stray.bin")
+    assert len(read_points(tmp_path / "stray.bin")) == 1000
     with pytest.raises(ScanError, match=r"expected metres about the sensor.*2\.5e\+04"):
         read_points(tmp_path / f"a{suffix}")
 
