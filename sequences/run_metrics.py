@@ -60,7 +60,7 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
         "skipped_frames": sum(bool(row.skipped_reason) for row in rows),
         "odometry_calibration": asdict(result.odometry_calibration),
         "filter_calibration": asdict(result.filter_calibration),
-        "trust": asdict(trust(rows, result.odometry_calibration)),
+        "trust": asdict(trust(rows, result.odometry_calibration, shows_buildings=result.map.shows_buildings)),
         **methods,
         "seconds_per_frame": {stage: value / len(rows) for stage, value in seconds.items()},
         "realtime_factor": duration / processing,

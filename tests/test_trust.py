@@ -39,6 +39,18 @@ def test_evidence_is_counted_from_that_of_a_random_pose() -> None:
     assert trust([full], OdometryCalibration()).evidence_gain_nats == pytest.approx(5.0)
 
 
+def test_what_is_flattened_more_has_to_say_less() -> None:
+    flattened = [replace(row, temperature=6.2) for row in rows([1.6] * 3, [0.0] * 3)]
+    assert trust(flattened, OdometryCalibration()).doubts == []
+    assert len(trust(rows([1.6] * 3, [0.0] * 3), OdometryCalibration()).doubts) == 1
+    assert trust(rows([-0.8] * 2, [0.0] * 2), OdometryCalibration()).doubts == []  # too few to judge by
+
+
+def test_a_map_without_buildings_is_a_doubt() -> None:
+    (found,) = trust(rows([4.0] * 3, [0.0] * 3), OdometryCalibration(), shows_buildings=False).doubts
+    assert found.startswith("the map shows no buildings")
+
+
 @pytest.mark.parametrize(
     ("gains", "lost", "calibration", "doubt"),
     [
