@@ -49,7 +49,7 @@ class MapGrid:
 
     def __post_init__(self) -> None:
         keep_plain(self, self.__slots__)
-        if self.rows < 1 or self.cols < 1 or self.rows != int(self.rows) or self.cols != int(self.cols):
+        if not all(size >= 1 and float(size).is_integer() for size in (self.rows, self.cols)):
             raise SkyfixError(f"grid: expected whole numbers of pixels from 1 x 1 on, got {self.rows} x {self.cols}")
         if not (isfinite(self.metres_per_pixel) and self.metres_per_pixel > 0.0):
             raise SkyfixError(f"grid: expected metres_per_pixel > 0, got {self.metres_per_pixel}")

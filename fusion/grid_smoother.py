@@ -29,7 +29,7 @@ from fusion.grids.pose_lattice import PoseLattice
 from fusion.grids.scratch import Scratch
 from fusion.likelihood import PoseLikelihood
 from fusion.odometry import OdometryIncrement
-from fusion.trajectory import Trajectory
+from fusion.trajectory import Trajectory, rising_stamps
 
 _WHOLE = 2.0**100
 _LEAST = 1e-30
@@ -119,9 +119,7 @@ def smooth_on_grid(
         None if likelihood is None else likelihood.tempered(temperature).with_outliers(outlier)
         for likelihood, temperature in zip(likelihoods, temperatures, strict=True)
     ]
-    stamps = np.array([first_stamp_ns, *(increment.stamp_ns for increment in increments)], dtype=np.int64)
-    if (np.diff(stamps) <= 0).any():
-        raise SkyfixError("grid smoother: expected increasing stamps, got a repeat or a step back")
+    stamps = rising_stamps([first_stamp_ns, *(increment.stamp_ns for increment in increments)])
 
     scratch = Scratch()
     filtered, motions, log_evidence = _forward(start, increments, measurements, scratch)

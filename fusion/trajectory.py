@@ -26,6 +26,23 @@ def checked_stamps(stamps_ns: ArrayLike) -> IntArray:
     return stamps.astype(np.int64)
 
 
+def rising_stamps(stamps_ns: ArrayLike) -> IntArray:
+    """Stamps (N,) as `checked_stamps` gives them, each later than the one before.
+
+    Raises
+    ------
+    SkyfixError
+        As `checked_stamps`, and when one is not.
+    """
+    stamps = checked_stamps(stamps_ns)
+    not_later = np.flatnonzero(stamps[1:] <= stamps[:-1])
+    if len(not_later):
+        raise SkyfixError(
+            f"stamps: expected strictly increasing, got a repeat or a step back at index {not_later[0] + 1}"
+        )
+    return stamps
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """Poses over time.
@@ -53,12 +70,9 @@ class Trajectory:
     frame_id: str = "map"
 
     def __post_init__(self) -> None:
-        stamps = checked_stamps(self.stamp_ns)
+        stamps = rising_stamps(self.stamp_ns)
         if len(stamps) == 0:
             raise SkyfixError("trajectory: expected at least one pose, got none")
-        if (np.diff(stamps) <= 0).any():
-            at = int(np.flatnonzero(np.diff(stamps) <= 0)[0]) + 1
-            raise SkyfixError(f"trajectory: expected strictly increasing stamps, got a step back at index {at}")
         poses = checked("trajectory poses", self.poses, (len(stamps), 3)).copy()
         poses[:, 2] = se2.wrap(poses[:, 2])
         object.__setattr__(self, "stamp_ns", read_only(stamps))

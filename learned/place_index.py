@@ -15,9 +15,6 @@ and would save what is hardly spent.
 
 from __future__ import annotations
 
-import tokenize
-import zipfile
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,6 +29,7 @@ from fusion.arrays import Float32Array, FloatArray, IntArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
+from learned.damaged_files import UNREADABLE
 from learned.place_embedding import similarities
 from learned.place_vote import best_votes, vote_at
 
@@ -48,23 +46,6 @@ VOTE_CELLS = 2
 """Feature cells on a side of one of the coarse vote's."""
 _FEATURE_SCALE = 127.0
 """Features are unit vectors and kept as bytes."""
-_UNREADABLE = (
-    SkyfixError,
-    OSError,
-    EOFError,
-    LookupError,
-    ValueError,
-    TypeError,
-    ArithmeticError,
-    AttributeError,
-    RuntimeError,
-    MemoryError,
-    SyntaxError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What reading a damaged archive raises."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -281,7 +262,7 @@ class PlaceIndex:
                     str(data["map_digest"]),
                 )
                 read._check()
-        except _UNREADABLE as error:
+        except (SkyfixError, *UNREADABLE) as error:
             what = next(iter(str(error).splitlines()), type(error).__name__)
             raise SkyfixError(f"index {path.name}: expected a file that PlaceIndex.save wrote, got: {what}") from error
         return read

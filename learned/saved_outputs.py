@@ -17,8 +17,6 @@ grid. For a program whose values belong to corners, shift the grid by half a cel
 from __future__ import annotations
 
 import math
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -31,6 +29,7 @@ from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
 from fusion.location_orientation import LocationOrientationMaps
+from learned.damaged_files import UNREADABLE
 
 _YAW_OF = {"east": 0.0, "north": 0.5 * math.pi, "west": math.pi, "south": -0.5 * math.pi}
 _LEAST_PROBABILITY = 1e-30
@@ -200,7 +199,7 @@ def _load(path: Path, key: str | None) -> NDArray[Any]:
                 wanted = "one array or a key" if key is None else f"an array {key!r}"
                 raise SkyfixError(f"{path.name}: expected {wanted}, got {', '.join(names) or 'no arrays'}")
             return np.asarray(content[chosen])
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except UNREADABLE as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SkyfixError(f"{path.name}: expected a readable .npy or .npz of numbers, got: {reason}") from error
 

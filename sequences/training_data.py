@@ -8,12 +8,10 @@ once.
 from __future__ import annotations
 
 import os
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from fusion.errors import SkyfixError
 from fusion.grid import MapGrid
 from learned.bev import BevSettings, GroundModel, bev_counts
+from learned.damaged_files import UNREADABLE
 from learned.samples import SAMPLE_METRES_PER_PIXEL, UNKNOWN_PLACE, Sample, cut_sample
 from sequences.lidar import LidarModel, simulate_scan
 from sequences.osm import MapFeatures
@@ -253,7 +252,7 @@ def _read_samples(path: Path) -> list[Sample] | None:
             return [
                 Sample(counts, classes, row, col, yaw, (x, y)) for counts, classes, (row, col, yaw), (x, y) in columns
             ]
-    except (OSError, EOFError, KeyError, ValueError, BadZipFile, zlib.error):
+    except UNREADABLE:
         return None
 
 

@@ -48,7 +48,7 @@ def test_above_a_plane_a_slope_is_a_wall_and_flat_ground_is_ground() -> None:
 
 def test_an_unknown_ground_is_refused() -> None:
     with pytest.raises(SkyfixError, match="expected a ground of surface or plane, got 'mesh'"):
-        BevSettings(ground="mesh")  # type: ignore[arg-type]
+        BevSettings(ground="mesh")
 
 
 def test_the_ground_passes_under_a_building() -> None:

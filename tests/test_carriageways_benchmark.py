@@ -32,5 +32,12 @@ def test_a_row_for_every_method_and_length_with_the_prior_and_the_odometry_first
     methods = ("single shot", "filter", "filter after a quarter", "smoother")
     assert lengths[2:] == [(method, length) for method in methods for length in ("0", "30")]
     settings = [TrackSettings("emulated", seed=seed, correlation_length_m=30.0, snapshots=0) for seed in (0, 1)]
-    errors = [track(drive, matcher, each).metrics["smoother"]["position_error_m"]["mean"] for each in settings]
-    assert rows[-1][2] == f"{np.mean(errors):.2f} ± {np.std(errors, ddof=1):.2f}"
+    found = [track(drive, matcher, each).metrics["smoother"] for each in settings]
+    columns = [
+        [each["position_error_m"]["mean"] for each in found],
+        [each["heading_error_deg"]["mean"] for each in found],
+        [100.0 * each["ellipse95"] for each in found],
+        [each["nees"]["mean"] for each in found],
+    ]
+    for shown, values, digits in zip(rows[-1][2:], columns, (2, 2, 0, 2), strict=True):
+        assert shown == f"{np.mean(values):.{digits}f} ± {np.std(values, ddof=1):.{digits}f}"

@@ -89,7 +89,15 @@ def test_offset_refuses_other_pixels():
 
 
 @pytest.mark.parametrize(
-    "bad", [(0, 5, 1.0, 0, 0), (5, 0, 1.0, 0, 0), (5, 5, 0.0, 0, 0), (5, 5, np.nan, 0, 0), (1.5, 2, 1.0, 0, 0)]
+    "bad",
+    [
+        (0, 5, 1.0, 0, 0),
+        (5, 0, 1.0, 0, 0),
+        (5, 5, 0.0, 0, 0),
+        (5, 5, np.nan, 0, 0),
+        (1.5, 2, 1.0, 0, 0),
+        (np.nan, 2, 1.0, 0, 0),
+    ],
 )
 def test_impossible_grids_are_refused(bad):
     with pytest.raises(SkyfixError, match="grid"):

@@ -170,7 +170,7 @@ def test_bad_input_is_one_line():
     for word, call in {
         "grid smoother: expected 3 likelihoods": lambda: smooth_on_grid(start, 10, increments, likelihoods[:2]),
         "got 3 and 1": lambda: smooth_on_grid(start, 10, increments, likelihoods, [1.0]),
-        "grid smoother: expected increasing stamps": lambda: smooth_on_grid(start, 25, increments, likelihoods),
+        "stamps: expected strictly increasing": lambda: smooth_on_grid(start, 25, increments, likelihoods),
         "increment: expected one that stays": lambda: smooth_on_grid(start, 10, gone, likelihoods),
         "temperature: expected > 0": lambda: smooth_on_grid(start, 10, increments, likelihoods, [0.0, 1.0, 1.0]),
         "paths: expected a count >= 1": lambda: result.sample_paths(0, 1),

@@ -126,6 +126,10 @@ def test_coordinates_that_cannot_be_metres_are_refused(tmp_path: Path, suffix: s
     strays[3, 0] = 65_535.0
     strays.tofile(tmp_path / "stray.bin")
     assert len(read_points(tmp_path / "stray.bin")) == 1000
+    strays[:30, 0] = 65_535.0
+    strays.tofile(tmp_path / "stray.bin")
+    with pytest.raises(ScanError, match="expected metres about the sensor"):
+        read_points(tmp_path / "stray.bin")
     with pytest.raises(ScanError, match=r"expected metres about the sensor.*2\.5e\+04"):
         read_points(tmp_path / f"a{suffix}")
 

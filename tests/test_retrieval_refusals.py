@@ -155,3 +155,17 @@ def test_a_ground_that_is_nowhere_is_refused(matcher: RotMatch, index: PlaceInde
     for one in (matcher, GeometricMatcher()):
         with pytest.raises(SkyfixError, match=message):
             one.match(made_points(), ground_z, town(), search)
+
+
+def test_an_embedding_is_known_by_all_that_it_is_made_of(matcher: RotMatch, tmp_path: Path) -> None:
+    mine = embedding_of(matcher)
+    mine.save(tmp_path / "mine.safetensors")
+    assert PlaceEmbedding.load(tmp_path / "mine.safetensors").fingerprint == mine.fingerprint
+    others = [
+        replace(mine, scan_weights=2.0 * mine.scan_weights),
+        replace(mine, map_weights=2.0 * mine.map_weights),
+        replace(mine, scan_mean=mine.scan_mean + 1.0),
+        replace(mine, map_mean=mine.map_mean + 1.0),
+        replace(mine, network="another"),
+    ]
+    assert len({mine.fingerprint, *(other.fingerprint for other in others)}) == 6

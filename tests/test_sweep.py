@@ -225,7 +225,7 @@ def test_a_bad_plan_is_one_line_and_nothing_is_tracked(
     made: MadeDrive, tmp_path: Path, options: dict[str, tuple[str, ...]], message: str
 ) -> None:
     with pytest.raises(SkyfixError, match=message) as caught:
-        plan_runs([made.path], SweepOptions(**options), tmp_path / "out")  # type: ignore[arg-type]
+        plan_runs([made.path], SweepOptions(**options), tmp_path / "out")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
 

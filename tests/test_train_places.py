@@ -175,6 +175,6 @@ def test_an_area_shows_all_its_samples_before_one_is_shown_again(of_area: int) -
         def area(self, number: int) -> list[tuple[int, int]]:
             return [(number, index) for index in range(of_area)]
 
-    shown = [sample for sample, _ in sequences.train_places._displaced(Source(), 2 * of_area, 0)]  # type: ignore[arg-type]
+    shown = [sample for sample, _ in sequences.train_places._displaced(Source(), 2 * of_area, 0)]
     assert len(set(shown[: 3 * of_area])) == len(set(shown)) == 3 * of_area
     assert set(shown[3 * of_area :]) == set(shown)

@@ -113,6 +113,10 @@ def test_prior_knows_its_edges():
             UniformPrior(np.zeros(3), half, heading)
 
 
+def test_stamps_may_span_all_of_64_bits():
+    assert len(Trajectory(np.array([-(2**62) - 5, 2**62 + 5]), np.zeros((2, 3)))) == 2
+
+
 def test_stamps_beyond_64_bits_are_refused():
     with pytest.raises(SkyfixError, match="stamps: expected int64 nanoseconds, got 9223372036854775817"):
         Trajectory(np.array([2**63 + 5, 2**63 + 9], dtype=np.uint64), np.zeros((2, 3)))

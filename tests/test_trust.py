@@ -1,5 +1,6 @@
 """Whether a run is to be believed: doubts where there is reason, and none on a drive that went well."""
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -87,3 +88,11 @@ def test_a_run_says_in_every_place_whether_to_believe_it(made_drive: MadeDrive, 
     assert read_metrics(tmp_path / "run")["trust"] == bad.metrics["trust"]
     assert f"doubtful: {doubt}" in closing_lines(bad.metrics)
     assert "Doubtful: the scans hardly agree" in report.read_text(encoding="utf-8")
+
+
+def test_the_map_of_a_run_is_judged(made_drive: MadeDrive) -> None:
+    layers = json.loads((made_drive.path / "map.json").read_text())
+    layers["layers"][0]["classes"] = ["grass", "road"]
+    (made_drive.path / "map.json").write_text(json.dumps(layers))
+    bare = track(FolderSequence(made_drive.path), EmulatedMatcher(made_drive.truth.poses), TrackSettings("wheels"))
+    assert [doubt[:26] for doubt in bare.metrics["trust"]["doubts"]] == ["the map shows no buildings"]
