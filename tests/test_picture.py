@@ -36,3 +36,17 @@ def test_what_is_no_picture_is_named(tmp_path: Path) -> None:
             read(tmp_path / "text.png")
         with pytest.raises(SkyfixError, match=r"none\.png: cannot be read: No such file"):
             read(tmp_path / "none.png")
+
+
+def test_indices_are_given_as_they_are_stored(tmp_path: Path) -> None:
+    deep = np.array([[0, 300], [65_535, 1]], np.uint16)
+    Image.fromarray(deep).save(tmp_path / "deep.png")
+    np.testing.assert_array_equal(read_indices(tmp_path / "deep.png"), deep)
+
+
+def test_a_picture_that_is_far_too_large_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.fromarray(np.zeros((30, 40), np.uint8)).save(tmp_path / "large.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    for read in (read_photograph, read_indices):
+        with pytest.raises(SkyfixError, match=r"large\.png: .*1200 pixels"):
+            read(tmp_path / "large.png")

@@ -236,6 +236,7 @@ def test_overrides_are_typed_and_checked(tiny: Path) -> None:
         ("calibration_samples=1", "calibration_samples: .*greater than or equal to 2"),
         ("validation_samples=0", "validation_samples: .*greater than or equal to 1"),
         ("extracts={a: 0.0}", r"extracts\.a: .*greater than 0"),
+        ("extracts={a: .inf}", r"extracts\.a: .*finite number"),
     ):
         with pytest.raises(SkyfixError, match=message) as caught:
             read_config(tiny, [override])

@@ -167,14 +167,26 @@ def test_what_does_not_fit_is_one_line_before_anything_is_simulated(
         PlaceOptions(scans_per_area=0)
 
 
+class Numbered:
+    """Neighbourhoods whose samples are numbers."""
+
+    areas = 3
+
+    def __init__(self, of_area: int) -> None:
+        self._of_area = of_area
+
+    def area(self, number: int) -> list[tuple[int, int]]:
+        return [(number, index) for index in range(self._of_area)]
+
+
 @pytest.mark.parametrize("of_area", [1, 4, 6, 7, 8, 16])
 def test_an_area_shows_all_its_samples_before_one_is_shown_again(of_area: int) -> None:
-    class Source:
-        areas = 3
-
-        def area(self, number: int) -> list[tuple[int, int]]:
-            return [(number, index) for index in range(of_area)]
-
-    shown = [sample for sample, _ in sequences.train_places._displaced(Source(), 2 * of_area, 0)]
+    shown = [sample for sample, _ in sequences.train_places._displaced(Numbered(of_area), 2 * of_area, 0)]
     assert len(set(shown[: 3 * of_area])) == len(set(shown)) == 3 * of_area
     assert set(shown[3 * of_area :]) == set(shown)
+
+
+def test_the_samples_of_the_shipped_embedding_are_those_that_it_was_trained_on() -> None:
+    """Four of sixteen, far apart."""
+    shown = [sample for sample, _ in sequences.train_places._displaced(Numbered(16), 4, 0)]
+    assert shown == [(area, 4 * turn + area) for turn in range(4) for area in range(3)]

@@ -37,7 +37,9 @@ def test_evidence_is_counted_from_that_of_a_random_pose() -> None:
     assert found.lost_share == 0.0
     assert found.doubts == []
     full = replace(ROW, search_half_heading_rad=4.0, log_evidence=-math.log(1600.0 * 2.0 * math.pi) + 5.0)
-    assert trust([full], OdometryCalibration()).evidence_gain_nats == pytest.approx(5.0)
+    short = trust([full], OdometryCalibration())
+    assert short.evidence_gain_nats == pytest.approx(5.0)
+    assert short.doubts == []  # one scan of one
 
 
 def test_what_is_flattened_more_has_to_say_less() -> None:
