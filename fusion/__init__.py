@@ -35,6 +35,7 @@ from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
 from fusion.odometry_calibration import calibrate_odometry
 from fusion.odometry_errors import OdometryCalibration
+from fusion.odometry_limits import MotionKind, OdometryLimits
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings, ParticleFilterState
 from fusion.particle_smoother import ParticleSmootherSettings, PathSamples, sample_paths
 from fusion.particles.cloud_history import CloudHistory, RecordedCloud
@@ -42,7 +43,6 @@ from fusion.particles.kld_sampling import KldSampling
 from fusion.pose_filter import PoseFilter, UpdateReport
 from fusion.prior import UniformPrior
 from fusion.tracker import Tracker
-from fusion.tracking.odometry_limits import MotionKind, OdometryLimits
 from fusion.tracking.resumable import ResumableFilter
 from fusion.tracking.tracker_report import Arrival, Measured, Outcome, Statistics
 from fusion.tracking.tracker_settings import TrackerSettings

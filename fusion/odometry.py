@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from fusion import se2
 from fusion.arrays import FloatArray, checked, keep_plain, read_only
 from fusion.errors import SkyfixError
+from fusion.odometry_doubts import OdometryDoubts
 from fusion.trajectory import Trajectory, rising_stamps
 
 _NS = 1e-9
@@ -117,7 +118,11 @@ class OdometryNoise:
 
 
 def increments_at(
-    stamps_ns: ArrayLike, odometry: Trajectory, noise: OdometryNoise, tolerance_ns: int = 0
+    stamps_ns: ArrayLike,
+    odometry: Trajectory,
+    noise: OdometryNoise,
+    tolerance_ns: int = 0,
+    doubts: OdometryDoubts | None = None,
 ) -> list[OdometryIncrement]:
     """The N - 1 motions between N stamps, by an odometry trajectory in a frame of its own.
 
@@ -131,6 +136,8 @@ def increments_at(
         Gives each motion its covariance.
     tolerance_ns : int
         How far a stamp may lie outside the odometry's span; there the odometry stands still.
+    doubts : OdometryDoubts, optional
+        Where the odometry is known less well, see `fusion.odometry_doubts.believed`.
 
     Raises
     ------
@@ -141,6 +148,8 @@ def increments_at(
     poses = odometry.interpolate(stamps, tolerance_ns)
     deltas = se2.between(poses[:-1], poses[1:])
     covariances = noise.covariances(deltas, np.diff(stamps) * _NS)
+    if doubts is not None:
+        covariances = covariances + doubts.between(stamps)
     return [
         OdometryIncrement(int(stamp), delta, covariance)
         for stamp, delta, covariance in zip(stamps[1:], deltas, covariances, strict=True)

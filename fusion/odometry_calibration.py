@@ -32,6 +32,7 @@ from fusion.graph.odometry_drift import OdometryDrift
 from fusion.graph.propagation import Propagated, propagate
 from fusion.graph.smoother_settings import SmootherSettings
 from fusion.odometry import OdometryNoise
+from fusion.odometry_doubts import OdometryDoubts
 from fusion.odometry_errors import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory, rising_stamps
@@ -107,6 +108,7 @@ def calibrate_odometry(
     initial: Trajectory,
     settings: SmootherSettings | None = None,
     calibration_prior: CalibrationPrior | None = None,
+    doubts: OdometryDoubts | None = None,
 ) -> OdometryCalibration:
     """The most probable errors of an odometry, given what was measured along the drive.
 
@@ -127,6 +129,8 @@ def calibrate_odometry(
         For a filter, which cannot follow such changes, find the noise with `OdometryDrift.steady`.
     calibration_prior : CalibrationPrior
         What errors are usual.
+    doubts : OdometryDoubts
+        Where the odometry is known less well than its noise says.
 
     Raises
     ------
@@ -139,7 +143,8 @@ def calibrate_odometry(
     settings = settings or SmootherSettings()
     if len(stamps) < 2:
         return OdometryCalibration()
-    search = _Search(stamps, odometry, noise, prior, settings, settings.drift or OdometryDrift())
+    drift = settings.drift or OdometryDrift()
+    search = _Search(stamps, odometry, doubts or OdometryDoubts.none(), noise, prior, settings, drift)
     seen = Measurements(measurements, settings.outlier_probability, settings.clutter_log_density)
     sigmas = (calibration_prior or CalibrationPrior()).sigmas
     poses = initial.interpolate(stamps)
@@ -173,6 +178,7 @@ class _Search:
 
     stamps: IntArray
     odometry: Trajectory
+    doubts: OdometryDoubts
     noise: OdometryNoise
     prior: UniformPrior
     settings: SmootherSettings
@@ -183,7 +189,9 @@ class _Search:
         poses = calibration.corrected(self.odometry).interpolate(self.stamps)
         deltas = se2.between(poses[:-1], poses[1:])
         noise = calibration.noise(self.noise)
-        return Chain(deltas, raised(noise.covariances(deltas, np.diff(self.stamps) * 1e-9), _LEAST_VARIANCE))
+        covariances = noise.covariances(deltas, np.diff(self.stamps) * 1e-9)
+        covariances += self.doubts.later(calibration.clock_offset_s).between(self.stamps)
+        return Chain(deltas, raised(covariances, _LEAST_VARIANCE))
 
     def propagated(
         self, values: FloatArray, seen: Measurements, poses: FloatArray, covariances: FloatArray

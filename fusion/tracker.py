@@ -8,7 +8,7 @@
 It has no thread, no clock and no queue of its own accord: everything happens in the caller's calls. What comes late,
 but within the history, counts as if it had come in time, bit for bit (`fusion.tracking.timeline`); what comes later
 still is counted and dropped. Bad input raises and changes nothing. Odometry that cannot be true is not believed
-(`fusion.tracking.odometry_limits`, `fusion.tracking.clock_guard`). A tracker can be saved and goes on from the file bit
+(`fusion.odometry_limits`, `fusion.tracking.clock_guard`). A tracker can be saved and goes on from the file bit
 for bit.
 """
 
@@ -23,6 +23,7 @@ from fusion.estimate import Estimate
 from fusion.fixed_lag import FixedLagSettings
 from fusion.likelihood import PoseLikelihood
 from fusion.odometry import OdometryIncrement
+from fusion.odometry_limits import MotionKind
 from fusion.particle_filter import ParticleFilterSettings
 from fusion.prior import UniformPrior
 from fusion.tracking.archive import Tree, read_archive, write_archive
@@ -31,7 +32,6 @@ from fusion.tracking.estimators import EstimatorName, estimator_like, settings_o
 from fusion.tracking.estimators import estimator as make_estimator
 from fusion.tracking.likelihood_tree import is_same_likelihood
 from fusion.tracking.odometry_buffer import OdometrySample
-from fusion.tracking.odometry_limits import MotionKind
 from fusion.tracking.resumable import ResumableFilter
 from fusion.tracking.timeline import Progress, Timeline
 from fusion.tracking.tracker_input import (
@@ -182,7 +182,8 @@ class Tracker:
         ----------
         stamp_ns : int, optional
             Within the history or later; the newest odometry when left out. Beyond the newest odometry the last
-            velocity is held for `OdometryLimits.gap_s`, and the covariance grows with the time.
+            turn is held for `OdometryLimits.gap_s` and the last speed for `clock_jump_s`, and the covariance grows like
+            that of a vehicle whose acceleration nobody knows.
         max_modes : int
             Heaviest clusters to be told, if not 0.
 

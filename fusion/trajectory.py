@@ -94,6 +94,14 @@ class Trajectory:
         """First and last stamp."""
         return int(self.stamp_ns[0]), int(self.stamp_ns[-1])
 
+    def within(self, first_ns: int, last_ns: int) -> "Trajectory | None":
+        """The poses with stamps from one time to another, both included; None when there are none."""
+        kept = (self.stamp_ns >= first_ns) & (self.stamp_ns <= last_ns)
+        if not kept.any():
+            return None
+        covariances = None if self.covariances is None else self.covariances[kept]
+        return Trajectory(self.stamp_ns[kept], self.poses[kept], covariances, self.frame_id)
+
     def interpolate(self, stamps_ns: ArrayLike, tolerance_ns: int = 0) -> FloatArray:
         """Poses (M, 3) at `stamps_ns` (M,), moving at a constant body twist between neighbouring poses.
 

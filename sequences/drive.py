@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from fusion import se2
 from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
+from fusion.odometry_doubts import OdometryDoubts, believed
+from fusion.odometry_limits import OdometryLimits
 from fusion.trajectory import Trajectory
 from sequences.sequence import Sequence
 from sequences.trajectory_io import format_seconds
@@ -21,7 +23,7 @@ STAMP_TOLERANCE_NS = 1_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """Frames of a sequence that an odometry (and the truth, where there is one) covers.
+    """Frames of a sequence that an odometry covers.
 
     Attributes
     ----------
@@ -30,14 +32,18 @@ class Drive:
     indices
         (M,) scan index of each frame.
     odometry
-        Odometry poses at the frames' stamps, in their own frame.
+        Odometry poses at the frames' stamps, in their own frame, as they come.
+    motion, doubts
+        All of the odometry with its jumps taken out, and where it is known less well than its noise says.
     truth
-        True poses at the frames' stamps, or None.
+        True poses at the stamps of the frames that it covers, which are in a row; None where there is no ground truth.
     """
 
     sequence: Sequence
     indices: NDArray[np.int64]
     odometry: Trajectory
+    motion: Trajectory
+    doubts: OdometryDoubts
     truth: Trajectory | None
 
     @property
@@ -47,18 +53,39 @@ class Drive:
 
     @property
     def length_m(self) -> float:
-        """Path length of the truth, or of the odometry where there is none."""
-        return self.odometry.length_m if self.truth is None else self.truth.length_m
+        """Path length of the truth, or of the odometry where it does not cover all frames."""
+        whole = self.truth is not None and len(self.truth) == len(self.indices)
+        return self.truth.length_m if self.truth is not None and whole else self.odometry.length_m
+
+    def true_pose(self, frame: int) -> FloatArray | None:
+        """True pose (3,) at a frame, None where there is no truth."""
+        if self.truth is None:
+            return None
+        at = self.truth.within(int(self.stamps_ns[frame]), int(self.stamps_ns[frame]))
+        return None if at is None else at.poses[0]
 
 
-def load_drive(sequence: Sequence, odometry_name: str) -> Drive:
+def load_drive(
+    sequence: Sequence, odometry_name: str, limits: OdometryLimits | None = None, *, starts_at_truth: bool = True
+) -> Drive:
     """Bring scans, odometry and truth to common stamps.
+
+    Parameters
+    ----------
+    sequence
+        Scans, odometry and truth.
+    odometry_name
+        One of the sequence's.
+    limits
+        What the vehicle can do, fitted to the odometry.
+    starts_at_truth
+        Leave out frames before the ground truth, where there is any, so that the first true pose is known.
 
     Raises
     ------
     SkyfixError
-        If the odometry is unknown or unreadable, times are in another unit, or it or the truth leaves fewer than two of
-        the scans covered.
+        If the odometry is unknown or unreadable, times are in another unit, or it or the truth covers fewer than two of
+        the scans.
     """
     odometry = sequence.odometry(odometry_name)
     truth = sequence.ground_truth
@@ -66,17 +93,25 @@ def load_drive(sequence: Sequence, odometry_name: str) -> Drive:
     _check_seconds(stamps, "scans")
     _check_seconds(odometry.stamp_ns, f"odometry {odometry_name!r}")
     covered = _covered(stamps, odometry, f"odometry {odometry_name!r}")
+    known = covered
     if truth is not None:
-        covered &= _covered(stamps, truth, "ground truth")
+        known = covered & _covered(stamps, truth, "ground truth")
+        if known.sum() < 2:
+            raise SkyfixError(f"{sequence.name}: expected two scans covered by odometry and truth, got {known.sum()}")
+        if starts_at_truth:
+            covered &= stamps >= stamps[known][0]
     indices = np.flatnonzero(covered).astype(np.int64)
     if len(indices) < 2:
-        raise SkyfixError(f"{sequence.name}: expected two scans covered by odometry and truth, got {len(indices)}")
+        raise SkyfixError(f"{sequence.name}: expected two scans covered by the odometry, got {len(indices)}")
     used = stamps[indices]
+    motion, doubts = believed(odometry, (limits or OdometryLimits()).fitted(odometry))
     return Drive(
         sequence=sequence,
         indices=indices,
         odometry=_at(odometry, used),
-        truth=None if truth is None else _at(truth, used),
+        motion=motion,
+        doubts=doubts,
+        truth=None if truth is None else _at(truth, stamps[known]),
     )
 
 

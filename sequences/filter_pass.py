@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -86,6 +87,7 @@ class FilterPass:
         self._filter: ParticleFilter | None = None
         self._travelled_m = 0.0
         self._measured_at_m = 0.0
+        self._unknown_m2 = 0.0  # variance of the motion since then
         self._since_measured: list[OdometryIncrement] = []
         self._rng = np.random.default_rng([settings.seed, _FILTER_STREAM])
         self._start_cloud = StartCloud(prior, settings.particles, settings.filter.outlier_probability, self._rng)
@@ -157,6 +159,7 @@ class FilterPass:
         self._plan.move(increment.delta)
         self._travelled_m += float(np.hypot(*increment.delta[:2]))
         self._since_measured.append(increment)
+        self._unknown_m2 += 0.5 * float(np.trace(increment.covariance[:2, :2]))
 
     def _due(self) -> bool:
         if self._settings.measure_every_frames is not None:
@@ -164,7 +167,12 @@ class FilterPass:
         every_m = self._settings.measure_every_m
         if self._plan.phase is Phase.ANYWHERE:
             every_m = max(every_m, self._settings.search.whole_map_every_m)
-        return self._travelled_m - self._measured_at_m >= every_m
+        return self._since_measured_m >= every_m
+
+    @property
+    def _since_measured_m(self) -> float:
+        """How far the vehicle may have come since the last measurement, by an odometry that may not have watched."""
+        return max(self._travelled_m - self._measured_at_m, math.sqrt(self._unknown_m2))
 
     def _measure_if_due(
         self, particles: ParticleFilter, frame: int, watch: Stopwatch
@@ -202,7 +210,7 @@ class FilterPass:
         is_first = self._filter is None or (self._plan.phase is Phase.ANYWHERE and not self._anywhere.is_running)
         if is_first or self._correlation_m == 0.0:
             return 1.0
-        return correlated_error_temperature(self._travelled_m - self._measured_at_m, self._correlation_m)
+        return correlated_error_temperature(self._since_measured_m, self._correlation_m)
 
     def _start(self, measurement: Measurement) -> tuple[ParticleFilter, float]:
         """The filter after the first measurement, and the ln density that it gave to the start's box."""
@@ -280,10 +288,10 @@ class FilterPass:
         if measurement is None:
             return
         self.best[frame] = measurement.best_pose()
-        self._measured_at_m, self._since_measured = self._travelled_m, []
+        self._measured_at_m, self._since_measured, self._unknown_m2 = self._travelled_m, [], 0.0
         kept, wanted = len(self.snapshots), self._settings.snapshots
         if kept < wanted and self._travelled_m >= kept * self._drive.odometry.length_m / wanted:
-            sequence, truth = self._drive.sequence, self._drive.truth
+            sequence = self._drive.sequence
             self.snapshots.append(
                 take_snapshot(
                     int(self._drive.indices[frame]),
@@ -291,7 +299,7 @@ class FilterPass:
                     sequence.map,
                     sequence.ground_z,
                     estimate.pose,
-                    None if truth is None else truth.poses[frame],
+                    self._drive.true_pose(frame),
                 )
             )
 

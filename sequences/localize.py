@@ -15,6 +15,7 @@ import numpy as np
 
 from fusion.factor_graph import OdometryDrift
 from fusion.odometry import OdometryIncrement, increments_at
+from fusion.odometry_errors import OdometryCalibration
 from fusion.trajectory import Trajectory
 from learned.matcher import MapMatcher
 from sequences.drive import STAMP_TOLERANCE_NS, Drive, load_drive, place_odometry
@@ -64,7 +65,8 @@ def track(
         If the odometry is unknown or does not overlap the scans, the start is outside the map or cannot be had, the
         first scan cannot be used, or the matcher cannot use the map.
     """
-    drive = load_drive(sequence, settings.odometry)
+    is_drawn = settings.start is None and not settings.start_anywhere
+    drive = load_drive(sequence, settings.odometry, settings.limits, starts_at_truth=is_drawn)
     prior = start_prior(drive, settings)
     online = FilterPass(drive, _increments(drive, settings), matcher, prior, settings)
     if progress is not None:
@@ -80,10 +82,11 @@ def track(
         "map",
     )
     begin = time.perf_counter()
-    seen = (drive.stamps_ns, sequence.odometry(settings.odometry), settings.noise, online.patches, prior, filtered)
-    smoothed, calibration = smooth_drive(*seen, settings.smoother)
+    seen = (drive.stamps_ns, drive.motion, settings.noise, online.patches, prior, filtered)
+    smoothed, calibration = smooth_drive(*seen, settings.smoother, drive.doubts)
     smoothing_s = time.perf_counter() - begin
-    filter_calibration = calibrate_drive(*seen, replace(settings.smoother, drift=OdometryDrift.steady()))
+    steady = replace(settings.smoother, drift=OdometryDrift.steady())
+    filter_calibration = calibrate_drive(*seen, steady, drive.doubts)
     measured = sorted(online.best)
     result = RunResult(
         sequence_name=sequence.name,
@@ -107,6 +110,7 @@ def track(
         length_m=drive.length_m,
         odometry_calibration=calibration,
         filter_calibration=filter_calibration,
+        odometry_doubts=drive.doubts,
         log=[*_described(drive), *online.log],
         origin_lat_lon=origin_of(sequence),
     )
@@ -115,11 +119,11 @@ def track(
 
 def _increments(drive: Drive, settings: TrackSettings) -> list[OdometryIncrement]:
     """What moves the filter: the odometry as it comes, or corrected by what an earlier drive has shown."""
-    known = settings.calibration
-    if known is None:
-        return increments_at(drive.stamps_ns, drive.odometry, settings.noise)
-    odometry = known.corrected(drive.sequence.odometry(settings.odometry))
-    return increments_at(drive.stamps_ns, odometry, known.noise(settings.noise), STAMP_TOLERANCE_NS)
+    known = settings.calibration or OdometryCalibration()
+    motion, doubts = drive.motion, drive.doubts
+    if settings.calibration is not None:
+        motion, doubts = known.corrected(motion), doubts.later(known.clock_offset_s)
+    return increments_at(drive.stamps_ns, motion, known.noise(settings.noise), STAMP_TOLERANCE_NS, doubts)
 
 
 def _with_map_error(estimate: Trajectory, sigma_m: float) -> Trajectory:
@@ -131,14 +135,20 @@ def _with_map_error(estimate: Trajectory, sigma_m: float) -> Trajectory:
 
 
 def _error(drive: Drive, online: FilterPass, frame: int) -> float | None:
-    if drive.truth is None:
+    true_pose = drive.true_pose(frame)
+    if true_pose is None:
         return None
-    return float(position_errors(drive.truth.poses[[frame]], online.estimates[frame].pose[None])[0])
+    return float(position_errors(true_pose[None], online.estimates[frame].pose[None])[0])
 
 
 def _described(drive: Drive) -> list[str]:
     total = len(drive.sequence.stamps_ns)
     lines = [f"{len(drive.indices)} of {total} frames, {drive.length_m:.0f} m"]
     if len(drive.indices) < total:
-        lines.append(f"{total - len(drive.indices)} frames left out: not covered by the odometry or the ground truth")
+        because = "" if drive.truth is None else ", or before the ground truth that the start is drawn about"
+        lines.append(f"{total - len(drive.indices)} frames left out: not covered by the odometry{because}")
+    if drive.truth is not None and len(drive.truth) < len(drive.indices):
+        lines.append(f"errors are of the {len(drive.truth)} frames that the ground truth covers")
+    if len(drive.doubts):
+        lines.append(f"odometry: {drive.doubts}")
     return lines

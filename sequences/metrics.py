@@ -153,6 +153,11 @@ def drift(truth: Trajectory, smoother: Trajectory, odometry: Trajectory) -> dict
     }
 
 
+def scored(truth: Trajectory, estimate: Trajectory) -> Trajectory | None:
+    """The poses of an estimate whose stamps the truth covers; None when it covers none of them."""
+    return estimate.within(*truth.span_ns)
+
+
 def correlation_length(truth: NDArray[np.float64], single_shots: NDArray[np.float64]) -> float | None:
     """Over how many metres (1/e) the errors of poses (N, 3) repeat, by `fusion.estimate_error_correlation`.
 

@@ -12,6 +12,7 @@ from fusion.factor_graph import OdometryDrift, SmootherResult, SmootherSettings,
 from fusion.graph.measurements import Measurement
 from fusion.odometry import OdometryNoise, increments_at
 from fusion.odometry_calibration import calibrate_odometry
+from fusion.odometry_doubts import OdometryDoubts
 from fusion.odometry_errors import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
@@ -27,11 +28,13 @@ def calibrate_drive(
     prior: UniformPrior,
     filtered: Trajectory,
     settings: SmootherSettings,
+    doubts: OdometryDoubts | None = None,
 ) -> OdometryCalibration:
     """The odometry's errors by the frames that were measured; arguments as for `smooth_drive`."""
     seen = [(stamp, one) for stamp, one in zip(stamps_ns.tolist(), measurements, strict=True) if one is not None]
     measured_ns = np.array([stamp for stamp, _ in seen], dtype=np.int64)
-    return calibrate_odometry(measured_ns, odometry, noise, [one for _, one in seen], prior, filtered, settings)
+    matched = [one for _, one in seen]
+    return calibrate_odometry(measured_ns, odometry, noise, matched, prior, filtered, settings, doubts=doubts)
 
 
 def smooth_drive(
@@ -42,6 +45,7 @@ def smooth_drive(
     prior: UniformPrior,
     filtered: Trajectory,
     settings: SmootherSettings | None = None,
+    doubts: OdometryDoubts | None = None,
 ) -> tuple[SmootherResult, OdometryCalibration]:
     """Calibrate the odometry by the measurements, then smooth with what it came to.
 
@@ -59,6 +63,8 @@ def smooth_drive(
         The filter's answer, where the smoother starts from.
     settings
         The smoother's; a drift of its own is replaced by the one that was found.
+    doubts
+        Where the odometry is known less well than its noise says.
 
     Raises
     ------
@@ -66,8 +72,9 @@ def smooth_drive(
         If the odometry does not cover the stamps or the optimisation diverges.
     """
     settings = settings or SmootherSettings()
-    calibration = calibrate_drive(stamps_ns, odometry, noise, measurements, prior, filtered, settings)
+    calibration = calibrate_drive(stamps_ns, odometry, noise, measurements, prior, filtered, settings, doubts)
     moved = calibration.corrected(odometry)
-    increments = increments_at(stamps_ns, moved, calibration.noise(noise), tolerance_ns=_TOLERANCE_NS)
+    doubts = None if doubts is None else doubts.later(calibration.clock_offset_s)
+    increments = increments_at(stamps_ns, moved, calibration.noise(noise), _TOLERANCE_NS, doubts)
     drifting = replace(settings, drift=calibration.drift(OdometryDrift()))
     return smooth(stamps_ns, increments, measurements, prior, filtered, drifting), calibration

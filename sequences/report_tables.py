@@ -84,16 +84,21 @@ def provenance(result: RunResult) -> list[str]:
     scans = "simulated: ray-cast from the map, not measured" if result.scans_simulated else "measured by a LiDAR"
     emulated = odometry_is_emulated(result.odometry_source)
     odometry = "emulated: made from the ground truth with drift added" if emulated else "as given with the sequence"
+    doubts = f"; {result.odometry_doubts}" if len(result.odometry_doubts) else ""
     prior = result.prior
     heading = np.rad2deg(prior.half_heading_rad)
     known = "heading unknown" if heading >= 180.0 else f"heading within ±{heading:g}°"
     measured = sum(row.measured for row in result.frame_rows)
     skipped = sum(bool(row.skipped_reason) for row in result.frame_rows)
     unusable = f", {skipped} more could not be" if skipped else ""
-    truth = "none: no errors are given" if result.truth is None else "compared in the map frame, with no alignment"
+    truth = "none: no errors are given"
+    if result.truth is not None:
+        truth = "compared in the map frame, with no alignment"
+        frames = len(result.frame_rows)
+        truth += f", at the {len(result.truth)} of {frames} frames that it covers" * (len(result.truth) < frames)
     return [
         f"LiDAR scans: {scans}.",
-        f"Odometry '{result.odometry_source}': {odometry}.",
+        f"Odometry '{result.odometry_source}': {odometry}{doubts}.",
         f"Start: position within ±{prior.half_extent_m:g} m in x and y, {known}; the odometry begins at its middle.",
         f"Matcher '{result.matcher_name}': {measured} of {len(result.frame_rows)} scans matched{unusable}.",
         f"Ground truth: {truth}.",

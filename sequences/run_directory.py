@@ -132,14 +132,14 @@ def _frame_line(result: RunResult, number: int, row: FrameRow) -> dict[str, str 
 def _estimate_cells(name: str, estimate: Trajectory, truth: Trajectory | None, number: int) -> dict[str, str]:
     cells: dict[str, str] = {}
     if truth is not None:
-        true_pose, pose = truth.poses[[number]], estimate.poses[[number]]
-        longitudinal, lateral, heading = (float(error[0]) for error in vehicle_frame_errors(true_pose, pose))
-        cells |= {
-            f"{name}_error_m": _cell(position_errors(true_pose, pose)[0]),
-            f"{name}_longitudinal_m": _cell(longitudinal),
-            f"{name}_lateral_m": _cell(lateral),
-            f"{name}_heading_deg": _cell(np.rad2deg(heading)),
-        }
+        names = ("error_m", "longitudinal_m", "lateral_m", "heading_deg")
+        errors: list[float] | list[None] = [None] * len(names)
+        known = truth.within(int(estimate.stamp_ns[number]), int(estimate.stamp_ns[number]))
+        if known is not None:
+            true_pose, pose = known.poses, estimate.poses[[number]]
+            longitudinal, lateral, heading = (float(error[0]) for error in vehicle_frame_errors(true_pose, pose))
+            errors = [float(position_errors(true_pose, pose)[0]), longitudinal, lateral, float(np.rad2deg(heading))]
+        cells |= {f"{name}_{what}": _cell(error) for what, error in zip(names, errors, strict=True)}
     if estimate.covariances is not None:
         covariance = estimate.covariances[number]
         entries = {"xx": (0, 0), "xy": (0, 1), "xyaw": (0, 2), "yy": (1, 1), "yyaw": (1, 2), "yawyaw": (2, 2)}

@@ -8,9 +8,10 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+from fusion.odometry_limits import MotionKind
 from fusion.trajectory import Trajectory
 from sequences.filter_pass import STAGES
-from sequences.metrics import after_first_quarter, correlation_length, drift, summarise
+from sequences.metrics import after_first_quarter, correlation_length, drift, scored, summarise
 from sequences.run_result import RunResult
 from sequences.sequence import odometry_is_emulated
 from sequences.start import prior_answers
@@ -34,7 +35,8 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
     -------
     The methods `prior`, `odometry`, `single_shot` (measured frames only), `filter`, `filter_after_first_quarter` (of
     the way) and `smoother`, as `metrics.summarise` describes them, `drift`, and `single_shot_correlation_length_m`,
-    None where too few scans were matched to say; none of these without ground truth.
+    None where too few scans were matched to say; none of these without ground truth, and of the frames that it covers
+    where it does not cover all.
     Always: what was run, whether to believe it (`sequences.trust`), and `seconds_per_frame` by stage, averaged over all
     frames.
     """
@@ -60,6 +62,11 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
         "skipped_frames": sum(bool(row.skipped_reason) for row in rows),
         "odometry_calibration": asdict(result.odometry_calibration),
         "filter_calibration": asdict(result.filter_calibration),
+        "odometry_doubts": {
+            "jumps": result.odometry_doubts.count(MotionKind.RESET),
+            "gaps": result.odometry_doubts.count(MotionKind.GAP),
+            "gap_seconds": result.odometry_doubts.seconds(MotionKind.GAP),
+        },
         "trust": asdict(trust(rows, result.odometry_calibration, shows_buildings=result.map.shows_buildings)),
         **methods,
         "seconds_per_frame": {stage: value / len(rows) for stage, value in seconds.items()},
@@ -68,18 +75,25 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
 
 
 def _methods(result: RunResult, truth: Trajectory) -> dict[str, Any]:
+    odometry, shots, filtered, smoother = (
+        scored(truth, one) for one in (result.odometry, result.single_shot, result.filter, result.smoother)
+    )
+    assert odometry is not None  # truth is at some of the frames
+    assert filtered is not None
+    assert smoother is not None
     trajectories = {
         "prior": prior_answers(truth, result.settings, result.prior),
-        "odometry": result.odometry,
-        "single_shot": result.single_shot,
-        "filter": result.filter,
-        "filter_after_first_quarter": after_first_quarter(truth, result.filter),
-        "smoother": result.smoother,
+        "odometry": odometry,
+        **({} if shots is None else {"single_shot": shots}),
+        "filter": filtered,
+        "filter_after_first_quarter": after_first_quarter(truth, filtered),
+        "smoother": smoother,
     }
     methods: dict[str, Any] = {name: _summary(truth, trajectory) for name, trajectory in trajectories.items()}
-    methods["drift"] = drift(truth, result.smoother, result.odometry)
-    shots = result.single_shot
-    methods["single_shot_correlation_length_m"] = correlation_length(truth.interpolate(shots.stamp_ns), shots.poses)
+    methods["drift"] = drift(truth, smoother, odometry)
+    methods["single_shot_correlation_length_m"] = (
+        None if shots is None else correlation_length(truth.interpolate(shots.stamp_ns), shots.poses)
+    )
     return methods
 
 

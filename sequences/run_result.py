@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusion.arrays import Float32Array, FloatArray
 from fusion.grid import MapGrid
+from fusion.odometry_doubts import OdometryDoubts
 from fusion.odometry_errors import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
@@ -106,7 +107,7 @@ class RunResult:
     stamps_ns
         (M,) the frames' stamps.
     truth
-        Ground truth at the frames, or None.
+        Ground truth at the frames that it covers, or None.
     odometry
         The odometry alone, started at the prior's mean.
     single_shot
@@ -124,11 +125,13 @@ class RunResult:
     scans_simulated
         True when the scans were ray-cast from the map.
     length_m
-        Path length of the truth, or of the odometry where there is none.
+        Path length of the truth, or of the odometry where the truth does not cover all frames.
     odometry_calibration
         The odometry's errors, as the smoother found and removed them.
     filter_calibration
         The same for a filter, which cannot follow a scale that wanders and takes it as noise.
+    odometry_doubts
+        Jumps and gaps of the odometry.
     log
         Lines of `log.txt`.
     origin_lat_lon
@@ -154,5 +157,6 @@ class RunResult:
     length_m: float
     odometry_calibration: OdometryCalibration
     filter_calibration: OdometryCalibration
+    odometry_doubts: OdometryDoubts
     log: list[str]
     origin_lat_lon: tuple[float, float] | None = None

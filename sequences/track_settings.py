@@ -9,10 +9,11 @@ from fusion.errors import SkyfixError
 from fusion.factor_graph import OdometryDrift, SmootherSettings
 from fusion.odometry import OdometryNoise
 from fusion.odometry_errors import OdometryCalibration
+from fusion.odometry_limits import OdometryLimits
 from fusion.particle_filter import ParticleFilterSettings
 from sequences.search_settings import SearchSettings
 
-GROUPS = ("search", "filter", "smoother", "noise")
+GROUPS = ("search", "filter", "smoother", "noise", "limits")
 """Fields of `TrackSettings` that hold settings of their own."""
 
 
@@ -58,6 +59,9 @@ class TrackSettings:
         smoother, whose drift is found from the drive and is none here.
     noise
         The odometry's noise, standard deviations that grow with the root of the distance.
+    limits
+        What the odometry can be believed to have done; gaps and jumps cost certainty. Fitted to the odometry's own rate
+        and speeds, see `OdometryLimits.fitted`.
     calibration
         The odometry's errors, known from an earlier drive; the filter gets it corrected and its noise as it was found.
         The smoother finds them by itself. None: the odometry as it comes.
@@ -80,6 +84,7 @@ class TrackSettings:
     filter: ParticleFilterSettings = field(default_factory=ParticleFilterSettings)
     smoother: SmootherSettings = field(default_factory=SmootherSettings)
     noise: OdometryNoise = field(default_factory=OdometryNoise)
+    limits: OdometryLimits = field(default_factory=OdometryLimits)
     calibration: OdometryCalibration | None = None
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from fusion import se2
 from fusion.grid import MapGrid
+from fusion.odometry_doubts import OdometryDoubts
 from fusion.odometry_errors import OdometryCalibration
 from fusion.prior import UniformPrior
 from fusion.trajectory import Trajectory
@@ -86,6 +87,7 @@ def made_run(frames: int = 120, *, with_truth: bool = True, snapshots: int = 6, 
         length_m=truth.length_m,
         odometry_calibration=CALIBRATION,
         filter_calibration=CALIBRATION,
+        odometry_doubts=OdometryDoubts.none(),
         log=["frame 9 (4.5 s): not measured: scan 8: expected points, got none", "<i>second line</i>"],
     )
 

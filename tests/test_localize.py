@@ -34,7 +34,7 @@ from sequences.run_result import FrameRow, RunResult
 from sequences.sequence import ScanError
 from sequences.start import prior_answers, start_prior
 from sequences.track_settings import TrackSettings
-from sequences.trajectory_io import read_tum
+from sequences.trajectory_io import read_tum, write_tum
 
 SETTINGS = TrackSettings("wheels", seed=3, particles=3000)
 
@@ -82,6 +82,48 @@ def test_the_truth_is_not_tracked_with(made_drive: MadeDrive) -> None:
     assert without.metrics["ground_truth"] is False
     assert "filter" not in without.metrics
     assert without.length_m == pytest.approx(made_drive.odometry.length_m)
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 14), (6, 30), (10, 12)])
+def test_ground_truth_of_a_part_scores_that_part_and_cuts_nothing(
+    made_drive: MadeDrive, tmp_path: Path, first: int, last: int
+) -> None:
+    settings = replace(SETTINGS, start=(-22.0, -12.0, 20.0))
+    whole = run(made_drive, settings)
+    part = Trajectory(made_drive.truth.stamp_ns[first:last], made_drive.truth.poses[first:last])
+    write_tum(made_drive.path / "ground_truth.tum", part)
+    result = run(made_drive, settings)
+    np.testing.assert_array_equal(result.filter.poses, whole.filter.poses)
+    np.testing.assert_array_equal(result.smoother.poses, whole.smoother.poses)
+    assert (result.metrics["frames"], result.metrics["filter"]["frames"]) == (30, last - first)
+    errors = np.linalg.norm((whole.smoother.poses - made_drive.truth.poses)[first:last, :2], axis=1)
+    assert result.metrics["smoother"]["position_error_m"]["mean"] == pytest.approx(errors.mean(), abs=1e-5)
+    assert f"errors are of the {last - first} frames that the ground truth covers" in result.log
+    write_run(result, tmp_path / "run")
+    with (tmp_path / "run" / "frames.csv").open(newline="") as file:
+        told = [bool(line["filter_error_m"]) for line in csv.DictReader(file)]
+    assert told == [first <= number < last for number in range(30)]
+    assert f"at the {last - first} of 30 frames that it covers" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_a_start_drawn_about_the_truth_begins_where_the_truth_does(made_drive: MadeDrive) -> None:
+    write_tum(
+        made_drive.path / "ground_truth.tum",
+        Trajectory(made_drive.truth.stamp_ns[4:20], made_drive.truth.poses[4:20]),
+    )
+    result = run(made_drive)
+    assert (result.metrics["frames"], result.metrics["filter"]["frames"]) == (26, 16)
+    assert np.abs(result.prior.mean[:2] - made_drive.truth.poses[4, :2]).max() <= 20.0
+    assert result.log[1].startswith("4 frames left out: not covered by the odometry, or before the ground truth")
+
+
+def test_a_single_shot_that_no_truth_covers_is_not_scored(made_drive: MadeDrive) -> None:
+    part = Trajectory(made_drive.truth.stamp_ns[11:14], made_drive.truth.poses[11:14])
+    write_tum(made_drive.path / "ground_truth.tum", part)
+    result = run(made_drive, replace(SETTINGS, start=(-22.0, -12.0, 20.0), measure_every_frames=10))
+    assert "single_shot" not in result.metrics
+    assert "single_shot" not in series_of(result).errors
+    assert result.metrics["filter"]["frames"] == 3
 
 
 def test_an_odometry_whose_errors_are_known_carries_the_filter_further(made_drive: MadeDrive) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 from fusion import se2
 from fusion.arrays import FloatArray
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate
+from fusion.odometry_limits import MotionKind, OdometryLimits, part_of
 from fusion.tracking.archive import Tree
-from fusion.tracking.odometry_limits import MotionKind, OdometryLimits, part_of
 
 BEGINNING = -(2**63)
 """Before every stamp."""
@@ -147,7 +147,7 @@ class OdometryBuffer:
     def extrapolated(self, stamp_ns: int) -> OdometryIncrement:
         """The motion from the newest sample to a later stamp: the mean velocity of the last `gap_s` goes on.
 
-        It goes on for `gap_s` at most, and not at all after a gap or a reset; the variances grow as in a gap.
+        It turns for `gap_s` at most and goes on for `clock_jump_s` at most, and not at all after a gap or a reset.
         """
         newest_ns, gap_ns = self._stamps[-1], round(1e9 * self._limits.gap_s)
         start_ns = max(self._stamps[0], newest_ns - gap_ns)
@@ -156,9 +156,11 @@ class OdometryBuffer:
         inside = range(bisect_right(self._stamps, start_ns), len(self))
         if inside and all(self._kinds[index] is MotionKind.DRIVEN for index in inside):
             velocity = se2.log(self.motion(start_ns, newest_ns).delta) / (newest_ns - start_ns)
-            delta = se2.exp(velocity * min(ahead_ns, gap_ns))
-        seconds = min(1e-9 * ahead_ns, self._limits.clock_jump_s)
-        covariance = self._noise.covariance(delta, seconds) + self._limits.gap_covariance(seconds)
+            straight_ns = max(0, min(ahead_ns, round(1e9 * self._limits.clock_jump_s)) - gap_ns)
+            turned = se2.exp(velocity * min(ahead_ns, gap_ns))
+            delta = se2.compose(turned, np.array([*(straight_ns * velocity[:2]), 0.0]))
+        seconds = 1e-9 * ahead_ns
+        covariance = self._noise.covariance(delta, seconds) + self._limits.beyond_covariance(seconds)
         return OdometryIncrement(stamp_ns, delta, covariance)
 
     def forget_before(self, stamp_ns: int) -> None:
@@ -233,9 +235,7 @@ class OdometryBuffer:
         delta = part_of(self._deltas[index], share)
         known = share * min(seconds, self._limits.clock_jump_s)
         covariance = self._noise.covariance(delta, known) if own is None else share * own
-        if kind is not MotionKind.DRIVEN:
-            covariance = covariance + share * self._limits.gap_covariance(seconds)
-        return OdometryIncrement(stamp_ns, delta, covariance)
+        return OdometryIncrement(stamp_ns, delta, covariance + share * self._limits.added_covariance(kind, seconds))
 
 
 def sample_tree(sample: OdometrySample) -> dict[str, Tree]:

@@ -82,7 +82,7 @@ class Statistics:
     duplicates, conflicts : int
         Messages with a stamp that was there already, the same in content or not.
     gaps, resets, clock_jumps : int
-        Motions of these kinds, see `fusion.tracking.odometry_limits`.
+        Motions of these kinds, see `fusion.odometry_limits`.
     dismissed_odometry : int
         Withheld messages far ahead of the others whose clock was not believed.
     uncovered_likelihoods : int

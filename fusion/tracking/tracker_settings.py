@@ -8,8 +8,8 @@ import numpy as np
 from fusion.arrays import keep_plain
 from fusion.errors import SkyfixError
 from fusion.odometry import OdometryNoise
+from fusion.odometry_limits import OdometryLimits
 from fusion.tracking.archive import Tree
-from fusion.tracking.odometry_limits import OdometryLimits
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fusion.consistency import nees
 from fusion.trajectory import Trajectory
-from sequences.metrics import distance_along, map_frame_errors, vehicle_frame_errors
+from sequences.metrics import distance_along, map_frame_errors, scored, vehicle_frame_errors
 from sequences.run_result import RunResult
 
 FloatArray = NDArray[np.float64]
@@ -26,7 +26,7 @@ class MethodErrors:
     Attributes
     ----------
     distance_m
-        (N,) distance travelled at each pose.
+        (N,) distance travelled at each pose that the truth covers.
     position_m
         (N,) distance from the true position.
     signed
@@ -90,12 +90,16 @@ def trajectories_of(result: RunResult) -> dict[str, Trajectory]:
 
 
 def series_of(result: RunResult) -> RunSeries:
-    """Compute the curves of a run; distance is along the truth where there is one, else along the odometry."""
-    path = result.odometry if result.truth is None else result.truth
+    """Compute the curves of a run; distance is along the truth where it covers all frames, else along the odometry."""
+    truth = result.truth
+    path = result.odometry if truth is None or len(truth) < len(result.stamps_ns) else truth
     series = RunSeries(result.stamps_ns, distance_along(path.interpolate(result.stamps_ns)), {}, {})
-    if result.truth is not None:
-        for name, trajectory in trajectories_of(result).items():
-            true_poses = result.truth.interpolate(trajectory.stamp_ns)
+    if truth is not None:
+        for name, whole in trajectories_of(result).items():
+            trajectory = scored(truth, whole)
+            if trajectory is None:
+                continue
+            true_poses = truth.interpolate(trajectory.stamp_ns)
             signed = np.stack(vehicle_frame_errors(true_poses, trajectory.poses), axis=-1)
             position_m = np.hypot(signed[:, 0], signed[:, 1])
             series.errors[name] = MethodErrors(series.distance_at(trajectory.stamp_ns), position_m, signed)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sequences.figures.map_drawing import draw_map, draw_prior, north_arrow, scale_bar
 from sequences.figures.series import RunSeries, trajectories_of
 from sequences.figures.style import INK, halo, legend, new_figure, plot_method, tidy
+from sequences.metrics import scored
 from sequences.run_result import RunResult
 
 FloatArray = NDArray[np.float64]
@@ -99,12 +100,14 @@ def _worst_box(result: RunResult, series: RunSeries) -> tuple[Box, str]:
 
     Without truth: of where it is least sure.
     """
-    settled = series.distance_m >= _SETTLED_SHARE * series.distance_m[-1]
-    stamps = series.stamps_ns[settled]
-    poses = result.filter.poses[result.filter.stamp_ns >= stamps[0]]
-    if "filter" in series.errors:
-        errors = series.errors["filter"].position_m[-len(poses) :]
-        at, title = int(errors.argmax()), f"Worst after the first quarter: {errors.max():.2f} m"
+    settled_m = _SETTLED_SHARE * series.distance_m[-1]
+    poses = result.filter.poses[series.distance_m >= settled_m]
+    errors = series.errors.get("filter")
+    known = None if result.truth is None else scored(result.truth, result.filter)
+    if errors is not None and known is not None and (errors.distance_m >= settled_m).any():
+        after = errors.distance_m >= settled_m
+        poses, off_m = known.poses[after], errors.position_m[after]
+        at, title = int(off_m.argmax()), f"Worst after the first quarter: {off_m.max():.2f} m"
     elif result.filter.covariances is not None:
         spread = np.trace(result.filter.covariances[-len(poses) :, :2, :2], axis1=1, axis2=2)
         at, title = int(spread.argmax()), "Least sure after the first quarter"

@@ -1,0 +1,101 @@
+"""Where a recorded odometry cannot be believed: its jumps are taken out, and its gaps and jumps cost certainty.
+
+`fusion.tracking.odometry_buffer` does the same for an odometry that is still arriving.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from fusion import se2
+from fusion.arrays import FloatArray, IntArray
+from fusion.odometry_limits import MotionKind, OdometryLimits
+from fusion.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryDoubts:
+    """Spans of time in which an odometry's motion is known less than its noise says.
+
+    Parameters
+    ----------
+    spans_ns : (K, 2) int64
+        From one sample to the next; in order, not overlapping.
+    kinds : K MotionKind
+        What is wrong with each.
+    covariances : (K, 3, 3) float64
+        What each adds to the covariance of the motion across it, the same in all directions.
+    """
+
+    spans_ns: IntArray
+    kinds: tuple[MotionKind, ...]
+    covariances: FloatArray
+
+    @classmethod
+    def none(cls) -> Self:
+        """An odometry to be believed throughout."""
+        return cls(np.zeros((0, 2), dtype=np.int64), (), np.zeros((0, 3, 3)))
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+    def __str__(self) -> str:
+        """What is wrong, in words."""
+        jumps, gaps = self.count(MotionKind.RESET), self.count(MotionKind.GAP)
+        seconds = self.seconds(MotionKind.GAP)
+        found = [f"jumps {jumps} x, faster than the vehicle can go (not believed)"] if jumps else []
+        found += [f"{gaps} x without odometry, {seconds:.1f} s in all (bridged, with less certainty)"] if gaps else []
+        return "; ".join(found) or "nothing doubtful"
+
+    def count(self, kind: MotionKind) -> int:
+        """Spans of one kind."""
+        return self.kinds.count(kind)
+
+    def seconds(self, kind: MotionKind) -> float:
+        """Duration of all spans of one kind."""
+        chosen = [kind is other for other in self.kinds]
+        return 1e-9 * float(np.diff(self.spans_ns[chosen], axis=1).sum())
+
+    def later(self, seconds: float) -> "OdometryDoubts":
+        """The same with later stamps."""
+        return OdometryDoubts(self.spans_ns + round(1e9 * seconds), self.kinds, self.covariances)
+
+    def between(self, stamps_ns: IntArray) -> FloatArray:
+        """What they add to the covariances (N - 1, 3, 3) of the motions between N increasing stamps."""
+        added = np.zeros((len(stamps_ns) - 1, 3, 3))
+        for (begin, end), covariance in zip(self.spans_ns.tolist(), self.covariances, strict=True):
+            inside = np.diff(np.clip(stamps_ns, begin, end))
+            added += (inside / (end - begin))[:, None, None] * covariance
+        return added
+
+
+def believed(odometry: Trajectory, limits: OdometryLimits) -> tuple[Trajectory, OdometryDoubts]:
+    """An odometry without the motions that the vehicle cannot have made, and what is doubtful in it.
+
+    Across a jump it stands still, so that what follows goes on from where it was; gaps keep their motion.
+
+    Parameters
+    ----------
+    odometry : Trajectory
+        As it comes.
+    limits : OdometryLimits
+        What the vehicle can do; see `OdometryLimits.fitted`.
+    """
+    if len(odometry) < 2:
+        return odometry, OdometryDoubts.none()
+    deltas = se2.between(odometry.poses[:-1], odometry.poses[1:])
+    seconds = 1e-9 * np.diff(odometry.stamp_ns)
+    kinds = [limits.kind(delta, time) for delta, time in zip(deltas, seconds.tolist(), strict=True)]
+    at = [index for index, kind in enumerate(kinds) if kind is not MotionKind.DRIVEN]
+    doubts = OdometryDoubts(
+        spans_ns=np.array([odometry.stamp_ns[index : index + 2] for index in at], dtype=np.int64).reshape(-1, 2),
+        kinds=tuple(kinds[index] for index in at),
+        covariances=np.array([limits.added_covariance(kinds[index], seconds[index]) for index in at]).reshape(-1, 3, 3),
+    )
+    poses = odometry.poses.copy()
+    for index in (index for index in at if kinds[index] is MotionKind.RESET):
+        poses[index + 1 :] = se2.compose(poses[index], se2.between(poses[index + 1], poses[index + 1 :]))
+    if doubts.count(MotionKind.RESET) == 0:
+        return odometry, doubts
+    return Trajectory(odometry.stamp_ns, poses, None, odometry.frame_id), doubts

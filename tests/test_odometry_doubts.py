@@ -1,0 +1,169 @@
+"""Gaps and jumps of a recorded odometry: found by its own rate and speeds, and told as one that arrives would be."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from made_drive import EmulatedMatcher, MadeDrive
+
+from fusion import MotionKind, OdometryLimits, OdometryNoise, SkyfixError, Trajectory, increments_at, se2
+from fusion.odometry_doubts import OdometryDoubts, believed
+from fusion.tracking.odometry_buffer import OdometryBuffer, OdometrySample
+from sequences.drive import load_drive
+from sequences.folder import FolderSequence
+from sequences.localize import track
+from sequences.run_directory import write_run
+from sequences.track_settings import TrackSettings
+from sequences.trajectory_io import write_tum
+
+SECOND, TENTH = 1_000_000_000, 100_000_000
+NOISE, LIMITS = OdometryNoise(), OdometryLimits()
+
+
+def winding(count: int, step_ns: int = TENTH, speed: float = 8.0) -> Trajectory:
+    """An odometry at a constant speed through bends."""
+    times = np.arange(count) * step_ns * 1e-9
+    yaw = 0.5 * np.sin(0.4 * times)
+    steps = speed * step_ns * 1e-9 * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    return Trajectory(np.arange(count) * step_ns, np.column_stack([np.cumsum(steps, axis=0), yaw]), None, "odometry")
+
+
+def jumping(odometry: Trajectory, at: int, delta: list[float]) -> Trajectory:
+    """The same with a motion into one sample that the vehicle never made."""
+    poses = odometry.poses.copy()
+    there = se2.compose(poses[at - 1], np.array(delta))
+    poses[at:] = se2.compose(there, se2.between(poses[at], poses[at:]))
+    return Trajectory(odometry.stamp_ns, poses, None, "odometry")
+
+
+def without(odometry: Trajectory, begin: int, end: int) -> Trajectory:
+    """The same without some of its samples."""
+    kept = np.r_[0:begin, end : len(odometry)]
+    return Trajectory(odometry.stamp_ns[kept], odometry.poses[kept], None, "odometry")
+
+
+def test_an_odometry_without_faults_is_left_as_it_is():
+    odometry = winding(300)
+    motion, doubts = believed(odometry, LIMITS.fitted(odometry))
+    assert motion is odometry
+    assert (len(doubts), str(doubts)) == (0, "nothing doubtful")
+    np.testing.assert_array_equal(doubts.between(odometry.stamp_ns), np.zeros((299, 3, 3)))
+
+
+@pytest.mark.parametrize("delta", [[300.0, 0.0, 0.0], [-3.0, 2.0, 0.1], [0.8, 0.0, 1.5]])
+def test_a_jump_is_taken_out_and_everything_else_stays(delta):
+    odometry = winding(300)
+    spoiled = jumping(odometry, 120, delta)
+    motion, doubts = believed(spoiled, LIMITS.fitted(spoiled))
+    moved, true = (se2.between(one.poses[:-1], one.poses[1:]) for one in (motion, odometry))
+    np.testing.assert_allclose(np.delete(moved, 119, axis=0), np.delete(true, 119, axis=0), atol=1e-9)
+    np.testing.assert_allclose(moved[119], 0.0, atol=1e-9)
+    assert doubts.kinds == (MotionKind.RESET,)
+    np.testing.assert_array_equal(doubts.spans_ns, [[119 * TENTH, 120 * TENTH]])
+    # the vehicle went 0.8 m meanwhile, in half a standard deviation's reach
+    assert doubts.covariances[0, 0, 0] > 0.8**2
+    assert str(doubts) == "jumps 1 x, faster than the vehicle can go (not believed)"
+
+
+def test_a_gap_keeps_its_motion_and_costs_certainty_where_it_is():
+    spoiled = without(winding(300), 100, 140)
+    motion, doubts = believed(spoiled, LIMITS.fitted(spoiled))
+    assert motion is spoiled
+    assert doubts.kinds == (MotionKind.GAP,)
+    assert doubts.seconds(MotionKind.GAP) == pytest.approx(4.1)
+    assert str(doubts) == "1 x without odometry, 4.1 s in all (bridged, with less certainty)"
+    stamps = np.array([0, 50, 99, 110, 130, 140, 200]) * TENTH
+    added = doubts.between(stamps)
+    np.testing.assert_allclose(added.sum(axis=0), LIMITS.gap_covariance(4.1), rtol=1e-12)
+    assert (added[[0, 1, 5]] == 0.0).all()
+    np.testing.assert_allclose(added[3], 20 / 41 * LIMITS.gap_covariance(4.1), rtol=1e-12)
+    np.testing.assert_array_equal(doubts.later(1.5).between(stamps + 15 * TENTH), added)
+
+
+@given(
+    st.integers(20, 60),
+    st.integers(1, 40),
+    st.integers(70, 110),
+    st.lists(st.integers(0, 119), min_size=2, max_size=9, unique=True),
+)
+def test_a_recording_says_what_the_same_odometry_says_while_it_arrives(gap_at, gap_length, jump_at, asked):
+    spoiled = without(jumping(winding(120), jump_at, [-40.0, 3.0, 1.0]), gap_at, min(gap_at + gap_length, 65))
+    held = OdometryBuffer(NOISE, LIMITS)
+    for stamp, pose in zip(spoiled.stamp_ns.tolist(), spoiled.poses, strict=True):
+        held.insert(OdometrySample(stamp, pose))
+    motion, doubts = believed(spoiled, LIMITS)
+    stamps = np.unique([*spoiled.stamp_ns, *(np.array(asked) * TENTH + 17), 119 * TENTH])
+    stamps = stamps[stamps <= spoiled.stamp_ns[-1]]
+    found = increments_at(stamps, motion, NOISE, doubts=doubts)
+    for (start, end), one in zip(pairwise(stamps.tolist()), found, strict=True):
+        online = held.motion(start, end)
+        np.testing.assert_allclose(one.delta, online.delta, atol=1e-9)
+        # across a jump the recording's noise, which is that of standing still, comes on top
+        np.testing.assert_allclose(one.covariance, online.covariance, atol=1e-4)
+
+
+def test_limits_are_fitted_to_a_recordings_own_rate_and_speed():
+    keyframes = LIMITS.fitted(winding(200, step_ns=SECOND))
+    assert (keyframes.gap_s, keyframes.clock_jump_s) == (5.0, 199.0)
+    assert keyframes.max_speed_m_per_s == pytest.approx(24.0, rel=1e-6)
+    assert LIMITS.fitted(winding(200, speed=50.0)).max_speed_m_per_s == 60.0
+    assert LIMITS.fitted(winding(200, speed=0.2)).max_speed_m_per_s == 5.0  # jitter at a standstill is no jump
+    wild = winding(200)
+    for at in (50, 90, 130):
+        wild = jumping(wild, at, [300.0, 0.0, 0.0])
+    assert LIMITS.fitted(wild).max_speed_m_per_s == pytest.approx(24.0, rel=1e-6)
+    assert LIMITS.fitted(winding(8)).max_speed_m_per_s == 60.0  # too few to say
+    assert LIMITS.fitted(winding(1)) is LIMITS
+    assert replace(LIMITS, gap_s=2.0).fitted(winding(200)).gap_s == 2.0
+
+
+def test_the_end_of_what_nobody_watched_is_known_less_than_a_gap_of_the_same_time():
+    for seconds in (0.5, 2.0, 10.0, 60.0):
+        ratio = (
+            LIMITS.beyond_covariance(seconds)[0, 0] / replace(LIMITS, clock_jump_s=60.0).gap_covariance(seconds)[0, 0]
+        )
+        assert 1.0 < ratio < 8.0
+    with pytest.raises(SkyfixError, match="gap_growth_s: expected > 0, got 0"):
+        OdometryLimits(gap_growth_s=0.0)
+
+
+def test_no_doubts_are_none():
+    assert len(OdometryDoubts.none()) == 0
+    assert believed(winding(1), LIMITS)[1].kinds == ()
+
+
+@pytest.fixture
+def long_steps(made_drive: MadeDrive) -> tuple[MadeDrive, TrackSettings]:
+    """The made drive, and its odometry with a jump of 40 m in the middle."""
+    jumped = jumping(made_drive.odometry, 15, [40.0, 5.0, 0.2])
+    write_tum(made_drive.path / "odometry" / "jumping.tum", jumped)
+    return made_drive, TrackSettings("jumping", seed=3, particles=3000)
+
+
+def test_a_drive_is_tracked_across_a_jump_of_its_odometry(long_steps, tmp_path):
+    made, settings = long_steps
+    sequence = FolderSequence(made.path)
+    drive = load_drive(sequence, "jumping")
+    assert drive.doubts.count(MotionKind.RESET) == 1
+    np.testing.assert_allclose(drive.odometry.poses, sequence.odometry("jumping").poses, atol=1e-9)  # as it comes
+    believing = replace(settings, limits=OdometryLimits(max_speed_m_per_s=1e6))
+    results = {
+        name: track(sequence, EmulatedMatcher(made.truth.poses), one)
+        for name, one in {"limited": settings, "plain": replace(settings, odometry="wheels")}.items()
+    }
+    for method in ("filter", "smoother"):
+        mean = {name: result.metrics[method]["position_error_m"]["mean"] for name, result in results.items()}
+        assert mean["limited"] < mean["plain"] + 0.3
+    result = results["limited"]
+    assert result.metrics["odometry"]["position_error_m"]["max"] > 30.0  # odometry only is shown as it comes
+    assert result.metrics["odometry_doubts"] == {"jumps": 1, "gaps": 0, "gap_seconds": 0.0}
+    report = write_run(result, tmp_path / "run")
+    assert "jumps 1 x" in (tmp_path / "run" / "log.txt").read_text()
+    assert "jumps 1 x" in Path(report).read_text()
+    assert (
+        load_drive(sequence, "jumping", believing.limits).doubts.count(MotionKind.RESET) == 1
+    )  # its own speeds say so
