@@ -73,7 +73,9 @@ class OdometryDoubts:
 def believed(odometry: Trajectory, limits: OdometryLimits) -> tuple[Trajectory, OdometryDoubts]:
     """An odometry without the motions that the vehicle cannot have made, and what is doubtful in it.
 
-    Across a jump it stands still, so that what follows goes on from where it was; gaps keep their motion.
+    Across a jump it stands still, so that what follows goes on from where it was. Gaps keep their motion; where it is
+    shorter than the speed before and after them would have made it, the odometry may have missed it, and half of what
+    is missing is one standard deviation more.
 
     Parameters
     ----------
@@ -88,10 +90,14 @@ def believed(odometry: Trajectory, limits: OdometryLimits) -> tuple[Trajectory, 
     seconds = 1e-9 * np.diff(odometry.stamp_ns)
     kinds = [limits.kind(delta, time) for delta, time in zip(deltas, seconds.tolist(), strict=True)]
     at = [index for index, kind in enumerate(kinds) if kind is not MotionKind.DRIVEN]
+    added = [limits.added_covariance(kinds[index], seconds[index]) for index in at]
+    for index, covariance in zip(at, added, strict=True):
+        if kinds[index] is MotionKind.GAP:
+            covariance[:2, :2] += np.eye(2) * (0.5 * _missing_m(deltas, seconds, kinds, index)) ** 2
     doubts = OdometryDoubts(
         spans_ns=np.array([odometry.stamp_ns[index : index + 2] for index in at], dtype=np.int64).reshape(-1, 2),
         kinds=tuple(kinds[index] for index in at),
-        covariances=np.array([limits.added_covariance(kinds[index], seconds[index]) for index in at]).reshape(-1, 3, 3),
+        covariances=np.array(added).reshape(-1, 3, 3),
     )
     poses = odometry.poses.copy()
     for index in (index for index in at if kinds[index] is MotionKind.RESET):
@@ -99,3 +105,11 @@ def believed(odometry: Trajectory, limits: OdometryLimits) -> tuple[Trajectory, 
     if doubts.count(MotionKind.RESET) == 0:
         return odometry, doubts
     return Trajectory(odometry.stamp_ns, poses, None, odometry.frame_id), doubts
+
+
+def _missing_m(deltas: FloatArray, seconds: FloatArray, kinds: list[MotionKind], gap: int) -> float:
+    """By how much the motion across a gap is shorter than at the mean of the speeds on both sides of it."""
+    beside = [index for index in (gap - 1, gap + 1) if 0 <= index < len(kinds) and kinds[index] is MotionKind.DRIVEN]
+    lengths = np.hypot(deltas[:, 0], deltas[:, 1])
+    speed = float(np.mean(lengths[beside] / seconds[beside])) if beside else 0.0
+    return max(0.0, speed * float(seconds[gap]) - float(lengths[gap]))
