@@ -144,13 +144,18 @@ def drift(truth: Trajectory, smoother: Trajectory, odometry: Trajectory) -> dict
     errors = position_errors(truth.poses, smoother.poses)
     along = distance_along(truth.poses)
     first, last = along <= 0.25 * along[-1], along >= 0.75 * along[-1]
-    moved = se2.between(odometry.poses[0], odometry.poses[-1])
-    final = se2.compose(truth.poses[0], moved)
+    final = from_true_start(truth, odometry).poses[-1]
     return {
         "first_quarter_mean_m": _rounded(errors[first].mean()),
         "last_quarter_mean_m": _rounded(errors[last].mean()),
         "odometry_final_error_m": _rounded(np.linalg.norm(final[:2] - truth.poses[-1, :2])),
     }
+
+
+def from_true_start(truth: Trajectory, odometry: Trajectory) -> Trajectory:
+    """The odometry alone (stamps of `truth`), begun at the true first pose: its drift without an error of the start."""
+    moved = se2.between(odometry.poses[:1], odometry.poses)
+    return Trajectory(odometry.stamp_ns, se2.compose(truth.poses[:1], moved), None, truth.frame_id)
 
 
 def scored(truth: Trajectory, estimate: Trajectory) -> Trajectory | None:

@@ -14,7 +14,16 @@ from sequences.run_result import RunResult
 from sequences.sequence import odometry_is_emulated
 
 MISSING = "–"
-_ESTIMATORS = ("prior", "odometry", "single_shot", "filter", "filter_after_first_quarter", "smoother")
+_ESTIMATORS = {
+    "prior": ("prior", ""),
+    "odometry": ("odometry", ""),
+    "odometry_from_true_start": ("odometry", ", begun at the truth"),
+    "single_shot": ("single_shot", ""),
+    "filter": ("filter", ""),
+    "filter_after_first_quarter": ("filter", ", after first quarter"),
+    "smoother": ("smoother", ""),
+}
+"""metrics.json's methods in the order shown: the style that each is drawn in, and what is said besides its label."""
 _RECALLS = ("lateral_recall", "longitudinal_recall", "heading_recall")
 _THRESHOLDS = ("1", "3", "5")
 
@@ -108,12 +117,10 @@ def provenance(result: RunResult) -> list[str]:
 def method_rows(result: RunResult) -> list[MethodRow]:
     """Format metrics.json's object of each method that has one."""
     rows = []
-    for name in _ESTIMATORS:
+    for name, (method, besides) in _ESTIMATORS.items():
         summary = result.metrics.get(name)
         if summary:
-            method, _, part = name.partition("_after_")
-            label = f"{METHODS[method].label}, after {part.replace('_', ' ')}" if part else METHODS[method].label
-            rows.append(MethodRow(label, METHODS[method].colour, _cells(summary)))
+            rows.append(MethodRow(METHODS[method].label + besides, METHODS[method].colour, _cells(summary)))
     return rows
 
 

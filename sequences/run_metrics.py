@@ -11,7 +11,7 @@ from typing import Any
 from fusion.odometry_limits import MotionKind
 from fusion.trajectory import Trajectory
 from sequences.filter_pass import STAGES
-from sequences.metrics import after_first_quarter, correlation_length, drift, scored, summarise
+from sequences.metrics import after_first_quarter, correlation_length, drift, from_true_start, scored, summarise
 from sequences.run_result import RunResult
 from sequences.sequence import odometry_is_emulated
 from sequences.start import prior_answers
@@ -33,10 +33,10 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
 
     Returns
     -------
-    The methods `prior`, `odometry`, `single_shot` (measured frames only), `filter`, `filter_after_first_quarter` (of
-    the way) and `smoother`, as `metrics.summarise` describes them, `drift`, and `single_shot_correlation_length_m`,
-    None where too few scans were matched to say; none of these without ground truth, and of the frames that it covers
-    where it does not cover all.
+    The methods `prior`, `odometry`, `odometry_from_true_start`, `single_shot` (measured frames only), `filter`,
+    `filter_after_first_quarter` (of the way) and `smoother`, as `metrics.summarise` describes them, `drift`, and
+    `single_shot_correlation_length_m`, None where too few scans were matched to say; none of these without ground
+    truth, and of the frames that it covers where it does not cover all.
     Always: what was run, whether to believe it (`sequences.trust`), and `seconds_per_frame` by stage, averaged over all
     frames.
     """
@@ -84,6 +84,7 @@ def _methods(result: RunResult, truth: Trajectory) -> dict[str, Any]:
     trajectories = {
         "prior": prior_answers(truth, result.settings, result.prior),
         "odometry": odometry,
+        "odometry_from_true_start": from_true_start(truth, odometry),
         **({} if shots is None else {"single_shot": shots}),
         "filter": filtered,
         "filter_after_first_quarter": after_first_quarter(truth, filtered),

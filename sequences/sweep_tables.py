@@ -25,7 +25,9 @@ _COLUMNS: dict[str, tuple[str, float]] = {
     "NEES (3 expected)": ("nees.mean", 1),
 }
 """Header -> key of a method in metrics.json, and the unit it is shown in."""
-_SAME_FOR_ALL = ("prior", "odometry")
+_ROWS = {name: label for name, label in ROWS.items() if name != "smoother"}
+_ROWS |= {"filter_after_first_quarter": "filter, after first quarter", "smoother": ROWS["smoother"]}
+_SAME_FOR_ALL = ("prior", "odometry", "odometry_from_true_start")
 
 
 def write_sweep(out_dir: Path, runs: Sequence[SweepRun], failed: Mapping[str, str]) -> None:
@@ -48,7 +50,8 @@ def summary(runs: Sequence[SweepRun], failed: Mapping[str, str]) -> dict[str, An
     -------
     `runs_done`, `runs_planned`, `failed`: {label: reason}; `tables`: one a drive and odometry, each with `sequence`,
     `odometry`, `length_m`, `frames`, `scans_simulated`, `odometry_emulated` and `variants`: {name: {matcher, changes,
-    seeds, methods: {method: {dotted key of metrics.json: {mean, std}}}}}, std None for a single seed.
+    seeds, methods: {method: {dotted key of metrics.json: {mean, std}}}, doubts: {seed: [why not to believe it]}}}`, std
+    None for a single seed.
     """
     done = [(run, read_metrics(run.folder)) for run in runs if is_run_directory(run.folder)]
     tables: dict[tuple[str, str], dict[str, Any]] = {}
@@ -65,7 +68,8 @@ def summary(runs: Sequence[SweepRun], failed: Mapping[str, str]) -> dict[str, An
             "matcher": matcher_label(first.matcher),
             "changes": dict(first.changes),
             "seeds": [run.settings.seed for run, _ in each],
-            "methods": {method: over_seeds([metrics[method] for _, metrics in each]) for method in ROWS},
+            "methods": _methods([metrics for _, metrics in each]),
+            "doubts": {str(run.settings.seed): metrics["trust"]["doubts"] for run, metrics in each},
         }
     return {
         "runs_done": len(done),
@@ -75,12 +79,18 @@ def summary(runs: Sequence[SweepRun], failed: Mapping[str, str]) -> dict[str, An
     }
 
 
+def _methods(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The methods that every run has, over seeds."""
+    return {name: over_seeds([run[name] for run in runs]) for name in _ROWS if all(name in run for run in runs)}
+
+
 def markdown(content: Mapping[str, Any]) -> str:
     """The tables for a person, from what `summary` gave."""
     legend = (
         f"{content['runs_done']} of {content['runs_planned']} runs done. Mean ± standard deviation over seeds, where "
         "there are several; errors against the ground truth, nothing aligned. @1 m: the share of frames with an error "
-        "below 1 m. 'Prior' answers the middle of the box that the start is known to lie in, 'odometry' starts there.\n"
+        "below 1 m. 'Prior' answers the middle of the box that the start is known to lie in, 'odometry' starts there, "
+        "'odometry, true start' at the true first pose.\n"
     )
     parts = ["# Sweep\n", legend]
     if content["failed"]:
@@ -95,14 +105,21 @@ def markdown(content: Mapping[str, Any]) -> str:
             f"odometry {table['odometry']}{emulated}\n"
         )
         parts.append(_table(table["variants"]))
+        doubts = [
+            f"- {name}, seed {seed}: doubtful: {doubt}"
+            for name, facts in table["variants"].items()
+            for seed, of_run in facts["doubts"].items()
+            for doubt in of_run
+        ]
+        parts += [*doubts, ""] if doubts else []
     return "\n".join(parts)
 
 
 def _table(variants: Mapping[str, Any]) -> str:
     """A line a method and variant; what the variants have in common is said once."""
     rows = []
-    for method, label in ROWS.items():
-        scores = {name: facts["methods"][method] for name, facts in variants.items()}
+    for method, label in _ROWS.items():
+        scores = {name: facts["methods"][method] for name, facts in variants.items() if method in facts["methods"]}
         if method in _SAME_FOR_ALL and all(each == next(iter(scores.values())) for each in scores.values()):
             scores = {"-": next(iter(scores.values()))}
         for name, each in scores.items():

@@ -13,6 +13,7 @@ from fusion.odometry_errors import OdometryCalibration
 ROWS = {
     "prior": "prior",
     "odometry": "odometry",
+    "odometry_from_true_start": "odometry, true start",
     "single_shot": "single shot",
     "filter": "filter",
     "smoother": "smoother",
@@ -47,7 +48,11 @@ def run_table(metrics: dict[str, Any]) -> Table:
     for key, label in ROWS.items():
         if key in metrics:
             ellipse = metrics[key].get("ellipse95")
-            table.add_row(label, *error_cells(metrics[key]), "" if ellipse is None else f"{100 * ellipse:.0f} %")
+            table.add_row(
+                label.replace("odometry, ", "↳ "),
+                *error_cells(metrics[key]),
+                "" if ellipse is None else f"{100 * ellipse:.0f} %",
+            )
     return table
 
 

@@ -84,7 +84,8 @@ def test_track_writes_a_run_and_prints_its_table(tracked: TrackedRun) -> None:
     assert tracked.printed.code == 0
     metrics = json.loads((tracked.out / "metrics.json").read_text())
     for key, label in ROWS.items():
-        row = next(line for line in tracked.printed.out.splitlines() if line.strip().startswith(label))
+        shown = label.replace("odometry, ", "↳ ")
+        row = next(line for line in tracked.printed.out.splitlines() if line.strip().startswith(shown))
         assert f"{metrics[key]['position_error_m']['mean']:.2f}" in row
     assert str(tracked.out / "report.html") in tracked.printed.out
     assert (tracked.out / "report.html").stat().st_size > 10_000

@@ -95,10 +95,15 @@ def test_tables_are_of_what_the_runs_hold(swept: Path) -> None:
     assert text == markdown(content)
     assert "## bend: 58 m, 30 frames, real scans, odometry wheels\n" in text
     lines = [line.split(" | ")[:2] for line in text.splitlines() if line.startswith("| ")]
-    expected = [["| method", "matcher, settings"], ["| prior", "-"], ["| odometry", "-"]]
+    expected = [
+        ["| method", "matcher, settings"],
+        ["| prior", "-"],
+        ["| odometry", "-"],
+        ["| odometry, true start", "-"],
+    ]
     expected += [
         [f"| {method}", f"rotmatch, particles {particles}"]
-        for method in ("single shot", "filter", "smoother")
+        for method in ("single shot", "filter", "filter, after first quarter", "smoother")
         for particles in (300, 600)
     ]
     assert lines == expected

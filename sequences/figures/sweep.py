@@ -42,6 +42,8 @@ def _draw(axes: Axes, tables: Sequence[Mapping[str, Any]]) -> None:
     for table in tables:
         first, names = len(labels), list(table["variants"])
         for method in _SHOWN:
+            if not all(method in table["variants"][name]["methods"] for name in names):
+                continue
             spreads = [table["variants"][name]["methods"][method]["position_error_m.mean"] for name in names]
             _plot(axes, method, first, spreads, is_labelled=first == 0)
         labels += [
