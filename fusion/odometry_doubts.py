@@ -1,5 +1,8 @@
 """Where a recorded odometry cannot be believed: its jumps are taken out, and its gaps and jumps cost certainty.
 
+An odometry that has lost track often repeats its last pose. That is a gap too, where a vehicle cannot have stopped or
+set off so hard.
+
 `fusion.tracking.odometry_buffer` does the same for an odometry that is still arriving.
 """
 
@@ -12,6 +15,9 @@ from fusion import se2
 from fusion.arrays import FloatArray, IntArray
 from fusion.odometry_limits import MotionKind, OdometryLimits
 from fusion.trajectory import Trajectory
+
+_FROZEN_M_PER_S = 1e-3
+_HARDEST_M_PER_S2 = 10.0  # braking of a car on a dry road
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +90,7 @@ def believed(odometry: Trajectory, limits: OdometryLimits) -> tuple[Trajectory, 
     limits : OdometryLimits
         What the vehicle can do; see `OdometryLimits.fitted`.
     """
+    odometry = _thawed(odometry, limits)
     if len(odometry) < 2:
         return odometry, OdometryDoubts.none()
     deltas = se2.between(odometry.poses[:-1], odometry.poses[1:])
@@ -105,6 +112,23 @@ def believed(odometry: Trajectory, limits: OdometryLimits) -> tuple[Trajectory, 
     if doubts.count(MotionKind.RESET) == 0:
         return odometry, doubts
     return Trajectory(odometry.stamp_ns, poses, None, odometry.frame_id), doubts
+
+
+def _thawed(odometry: Trajectory, limits: OdometryLimits) -> Trajectory:
+    """Without the samples that repeat a pose at which the vehicle cannot have stood."""
+    seconds = 1e-9 * np.diff(odometry.stamp_ns)
+    speeds = np.linalg.norm(np.diff(odometry.poses[:, :2], axis=0), axis=1) / seconds
+    frozen = np.concatenate([[False], speeds < _FROZEN_M_PER_S, [False]])  # of the step into a sample
+    kept = np.ones(len(odometry), dtype=bool)
+    for first, last in np.flatnonzero(np.diff(frozen)).reshape(-1, 2).tolist():  # samples first to last are alike
+        beside = [step for step in (first - 1, last) if 0 <= step < len(speeds)]
+        hardest = max((float(speeds[step] / seconds[step]) for step in beside), default=0.0)
+        if seconds[first:last].sum() > limits.gap_s and hardest > _HARDEST_M_PER_S2:
+            kept[first + 1 : last + 1] = False
+    kept[-1] = True
+    if kept.all():
+        return odometry
+    return Trajectory(odometry.stamp_ns[kept], odometry.poses[kept], None, odometry.frame_id)
 
 
 def _missing_m(deltas: FloatArray, seconds: FloatArray, kinds: list[MotionKind], gap: int) -> float:

@@ -96,17 +96,51 @@ def test_a_gap_across_which_a_vehicle_at_speed_has_not_moved_says_that_the_motio
     )  # back to where it was at the last sample
     _, doubts = believed(spoiled, LIMITS.fitted(spoiled))
     usual = LIMITS.gap_covariance(4.1)
-    half_m = 0.5 * 8.0 * 4.1
+    half_m = 0.5 * (8.0 * 4.1 - 0.1)
     np.testing.assert_allclose(doubts.covariances[0] - usual, np.diag([half_m**2, half_m**2, 0.0]), atol=1e-9)
     for_real = without(straight, 100, 140)
     _, doubts = believed(for_real, LIMITS.fitted(for_real))
     np.testing.assert_allclose(doubts.covariances[0], usual, atol=1e-12)
-    halted = np.minimum(np.arange(300), 100)[:, None] * [0.8, 0.0, 0.0]  # it stands from the gap on
-    _, doubts = believed(without(Trajectory(straight.stamp_ns, halted), 100, 140), LIMITS)
-    assert doubts.covariances[0, 0, 0] > usual[0, 0]
     stood = np.zeros((300, 3))
     _, doubts = believed(without(Trajectory(straight.stamp_ns, stood), 100, 140), LIMITS)
     np.testing.assert_allclose(doubts.covariances[0], usual, rtol=1e-12)
+
+
+def test_a_pose_that_is_repeated_where_a_vehicle_at_speed_cannot_have_stopped_is_a_gap():
+    straight, limits = straight_on(300), LIMITS.fitted(straight_on(300))
+    for catches_up in (True, False):
+        poses = straight.poses.copy()
+        poses[101:141] = poses[100]
+        poses[141:] -= 0.0 if catches_up else [0.8 * 40, 0.0, 0.0]
+        frozen = Trajectory(straight.stamp_ns, poses, None, "odometry")
+        motion, doubts = believed(frozen, limits)
+        np.testing.assert_array_equal(motion.poses, np.delete(poses, range(101, 141), axis=0))
+        assert doubts.kinds == (MotionKind.GAP,)
+        np.testing.assert_array_equal(doubts.spans_ns, [[100 * TENTH, 141 * TENTH]])
+        spread_m = np.sqrt(doubts.covariances[0, 0, 0])
+        assert (spread_m < 4.0) if catches_up else (spread_m > 16.0)  # of the 33 m that it drove
+
+
+def test_a_vehicle_that_brakes_and_stands_is_believed():
+    speeds = np.concatenate([np.full(80, 8.0), np.linspace(8.0, 0.0, 25), np.zeros(100), np.linspace(0.0, 8.0, 25)])
+    stopping = Trajectory(np.arange(230) * TENTH, np.cumsum(0.1 * speeds)[:, None] * [1.0, 0.0, 0.0], None, "odometry")
+    motion, doubts = believed(stopping, LIMITS.fitted(stopping))
+    assert motion is stopping
+    assert len(doubts) == 0
+    poses = stopping.poses.copy()
+    poses[40:44] = poses[40]  # three tenths of a second: messages were dropped
+    assert len(believed(Trajectory(stopping.stamp_ns, poses, None, "odometry"), LIMITS.fitted(stopping))[0]) == 230
+
+
+@pytest.mark.parametrize("inside", [slice(200, 300), slice(0, 100)])
+def test_an_odometry_that_ends_or_begins_frozen_still_covers_its_time(inside):
+    straight = straight_on(300)
+    poses = straight.poses.copy()
+    poses[inside] = poses[inside][0]
+    motion, doubts = believed(Trajectory(straight.stamp_ns, poses, None, "odometry"), LIMITS.fitted(straight))
+    assert motion.span_ns == straight.span_ns
+    assert doubts.kinds == (MotionKind.GAP,)
+    assert doubts.seconds(MotionKind.GAP) == pytest.approx(10.0, abs=0.2)
 
 
 @given(
