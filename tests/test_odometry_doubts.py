@@ -91,9 +91,7 @@ def test_a_gap_keeps_its_motion_and_costs_certainty_where_it_is():
 
 def test_a_gap_across_which_a_vehicle_at_speed_has_not_moved_says_that_the_motion_was_missed():
     straight = straight_on(300)
-    spoiled = without(
-        jumping(straight, 140, [-0.8 * 40, 0.0, 0.0]), 100, 140
-    )  # back to where it was at the last sample
+    spoiled = without(jumping(straight, 140, [0.1 - 0.8 * 40, 0.0, 0.0]), 100, 140)  # 0.1 m from the last sample
     _, doubts = believed(spoiled, LIMITS.fitted(spoiled))
     usual = LIMITS.gap_covariance(4.1)
     half_m = 0.5 * (8.0 * 4.1 - 0.1)
