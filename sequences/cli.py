@@ -16,6 +16,7 @@ import typer
 from fusion.errors import SkyfixError
 from sequences.cli_ablate import ablate
 from sequences.cli_bag import bag
+from sequences.cli_check import check
 from sequences.cli_emulate import emulate
 from sequences.cli_evaluate import evaluate
 from sequences.cli_map import draw_map
@@ -36,6 +37,7 @@ app = typer.Typer(
 )
 
 app.command(epilog="Example: `skyfix demo --out runs/first`")(demo)
+app.command(epilog="Example: `skyfix check drives/mine --picture mine.png`")(check)
 app.command(
     epilog="Examples:\n\n"
     "`skyfix track drives/kitti_13 --odometry lidar_gicp`\n\n"

@@ -108,6 +108,14 @@ def write_json(path: Path | None, content: object) -> None:
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file, or say in one line why not."""
+    try:
+        path.write_bytes(content)
+    except OSError as error:
+        raise SkyfixError(f"{path}: cannot be written: {error.strerror}") from error
+
+
 def write_text(path: Path | None, content: str) -> None:
     """As `write_json`, text as it is."""
     if path is None:

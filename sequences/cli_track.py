@@ -114,10 +114,12 @@ def track(
     """
     from sequences.dotted_keys import changed
     from sequences.registry import OpenOptions, open_sequence
-    from sequences.run_files import read_calibration
+    from sequences.run_files import doubts_of, read_calibration
     from sequences.track_settings import GROUPS, TrackSettings
 
     opened = open_sequence(sequence, OpenOptions(seed, allow_pickle))
+    for doubt in doubts_of(calibration) if calibration is not None else ():
+        typer.echo(f"warning: --calibration {calibration}: this run is doubtful: {doubt}", err=True)
     settings = TrackSettings(
         odometry=odometry or default_odometry(opened),
         seed=seed,

@@ -57,6 +57,13 @@ def config_text(sequence_name: str, matcher_name: str, settings: TrackSettings) 
     return yaml.safe_dump({"sequence": sequence_name, "matcher": matcher_name, **content}, sort_keys=False)
 
 
+def doubts_of(run_dir: Path) -> list[str]:
+    """Why not to believe a run, as it says itself."""
+    found: Any = read_metrics(run_dir).get("trust")
+    doubts = found.get("doubts") if isinstance(found, dict) else None
+    return [str(doubt) for doubt in doubts] if isinstance(doubts, list) else []
+
+
 def read_calibration(run_dir: Path) -> OdometryCalibration:
     """The odometry's errors that a run has found, for a filter; `SkyfixError` when there are none to be read."""
     found: Any = read_metrics(run_dir).get("filter_calibration")

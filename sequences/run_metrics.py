@@ -41,7 +41,7 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
     frames.
     """
     methods = {} if result.truth is None else _methods(result, result.truth)
-    rows = result.frame_rows
+    rows, jumps = result.frame_rows, result.odometry_doubts.count(MotionKind.RESET)
     seconds = {stage: sum(row.milliseconds.get(stage, 0.0) for row in rows) / 1e3 for stage in STAGES}
     seconds["smooth"] = smoothing_seconds
     # A simulated scan costs what reading one would not.
@@ -63,11 +63,13 @@ def run_metrics(result: RunResult, smoothing_seconds: float) -> dict[str, Any]:
         "odometry_calibration": asdict(result.odometry_calibration),
         "filter_calibration": asdict(result.filter_calibration),
         "odometry_doubts": {
-            "jumps": result.odometry_doubts.count(MotionKind.RESET),
+            "jumps": jumps,
             "gaps": result.odometry_doubts.count(MotionKind.GAP),
             "gap_seconds": result.odometry_doubts.seconds(MotionKind.GAP),
         },
-        "trust": asdict(trust(rows, result.odometry_calibration, shows_buildings=result.map.shows_buildings)),
+        "trust": asdict(
+            trust(rows, result.odometry_calibration, shows_buildings=result.map.shows_buildings, jumps=jumps)
+        ),
         **methods,
         "seconds_per_frame": {stage: value / len(rows) for stage, value in seconds.items()},
         "realtime_factor": duration / processing,

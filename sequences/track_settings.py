@@ -103,6 +103,8 @@ class TrackSettings:
         for name in ("measure_every_m", "map_error_m", "correlation_length_m", "map_check_every_m", "snapshots"):
             if (getattr(self, name) or 0) < 0:
                 raise SkyfixError(f"{name}: expected 0 or more, got {getattr(self, name):g}")
+        if self.start is not None and len(self.start) != 3:
+            raise SkyfixError(f"start: expected x, y (m) and yaw (degrees), got {len(self.start)} numbers")
         if self.start_anywhere and self.start is not None:
             raise SkyfixError(f"start: expected none with start_anywhere, got {self.start}")
         if self.seed < 0:

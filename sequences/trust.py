@@ -26,6 +26,7 @@ _FEWEST = 3  # measurements that can be judged by
 _LOST = 0.5
 _USUAL_LOG_SCALE, _USUAL_NOISE = 0.1, 5.0
 _FEW, _MANY = 2, 10
+_MOST_JUMPS, _MANY_JUMPS = 3, 0.05  # of the frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +48,10 @@ class Trust:
     doubts: list[str]
 
 
-def trust(rows: Sequence[FrameRow], calibration: OdometryCalibration, *, shows_buildings: bool = True) -> Trust:
-    """Judge a run by its frames, the first of them measured, by what it found of its odometry, and by its map."""
+def trust(
+    rows: Sequence[FrameRow], calibration: OdometryCalibration, *, shows_buildings: bool = True, jumps: int = 0
+) -> Trust:
+    """Judge a run by its frames, the first of them measured, by its odometry and what was found of it, by its map."""
     gain = float(np.median([_gain_nats(row) for row in rows if row.log_evidence is not None]))
     temperature = float(np.median([row.temperature for row in rows if row.temperature is not None]))
     least = LEAST_GAIN_NATS * min(1.0, _USUAL_TEMPERATURE / temperature)
@@ -62,6 +65,8 @@ def trust(rows: Sequence[FrameRow], calibration: OdometryCalibration, *, shows_b
         )
     if not shows_buildings:
         doubts.append("the map shows no buildings: matching has to guess how far walls stand from the carriageway")
+    if jumps > max(_MOST_JUMPS, _MANY_JUMPS * len(rows)):
+        doubts.append(f"the odometry jumps {jumps} times: is it in metres, its times in seconds?")
     if measured < _FEW and len(rows) >= _MANY:
         doubts.append(f"only {measured} of {len(rows)} scans were matched: does the odometry move, and in metres?")
     if any(lost):

@@ -186,6 +186,25 @@ def test_a_run_without_a_calibration_is_named(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("trust", [None, {}, {"doubts": []}, {"doubts": ["lost for 9 of 30 frames"]}])
+def test_a_calibration_of_a_doubtful_run_is_taken_with_a_warning(
+    tracked: TrackedRun,
+    trust: dict[str, list[str]] | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = shutil.copytree(tracked.out, tmp_path / "run")
+    metrics = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(json.dumps(metrics | {"trust": trust}))
+    monkeypatch.setattr(learned.matcher, "load_matcher", lambda *_: EmulatedMatcher(tracked.made.truth.poses))
+    target = ("--out", str(tmp_path / "out"), "--particles", "500", "--quiet")
+    finished = skyfix(capsys, monkeypatch, "track", str(tracked.made.path), *target, "--calibration", str(run))
+    assert finished.code == 0
+    warning = f"warning: --calibration {run}: this run is doubtful: lost for 9 of 30 frames\n"
+    assert finished.err == (warning if trust and trust["doubts"] else "")
+
+
 def test_a_calibration_without_a_blur_is_one_of_none(tracked: TrackedRun, tmp_path: Path) -> None:
     """Runs of earlier versions did not look for it."""
     run = shutil.copytree(tracked.out, tmp_path / "run")

@@ -347,6 +347,7 @@ def test_the_best_pose_is_finer_than_a_cell(yaw: float) -> None:
         ({"half_heading_deg": 200.0}, "half_heading_deg: expected at most 180"),
         ({"half_extent_m": float("nan")}, "half_extent_m: expected a finite number"),
         ({"start": (0.0, float("inf"), 0.0)}, "start: expected a finite number"),
+        ({"start": (0.0, 1.0)}, "start: expected x, y .m. and yaw .degrees., got 2 numbers"),
         ({"measure_every_m": -4.0}, "measure_every_m: expected 0 or more"),
         ({"measure_every_frames": 0}, "measure_every_frames: expected 1 or more"),
         ({"correlation_length_m": -1.0}, "correlation_length_m: expected 0 or more"),

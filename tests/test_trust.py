@@ -54,6 +54,14 @@ def test_a_map_without_buildings_is_a_doubt() -> None:
     assert found.startswith("the map shows no buildings")
 
 
+def test_an_odometry_that_jumps_all_the_time_is_a_doubt() -> None:
+    frames = rows([4.0] * 100, [0.0] * 100)
+    assert trust(frames, OdometryCalibration(), jumps=5).doubts == []
+    (found,) = trust(frames, OdometryCalibration(), jumps=6).doubts
+    assert found == "the odometry jumps 6 times: is it in metres, its times in seconds?"
+    assert trust(frames[:10], OdometryCalibration(), jumps=3).doubts == []
+
+
 @pytest.mark.parametrize(
     ("gains", "lost", "calibration", "doubt"),
     [
