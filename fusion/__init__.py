@@ -34,6 +34,7 @@ from fusion.location_orientation import LocationOrientationMaps
 from fusion.modes import find_modes
 from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate, increments_at
 from fusion.odometry_calibration import calibrate_odometry
+from fusion.odometry_doubts import OdometryDoubts, believed_odometry
 from fusion.odometry_errors import OdometryCalibration
 from fusion.odometry_limits import MotionKind, OdometryLimits
 from fusion.particle_filter import ParticleFilter, ParticleFilterSettings, ParticleFilterState
@@ -91,6 +92,7 @@ __all__ = [
     "Measured",
     "MotionKind",
     "OdometryCalibration",
+    "OdometryDoubts",
     "OdometryDrift",
     "OdometryIncrement",
     "OdometryLimits",
@@ -118,6 +120,7 @@ __all__ = [
     "UniformPrior",
     "UpdateReport",
     "accumulate",
+    "believed_odometry",
     "calibrate_odometry",
     "estimate_error_correlation",
     "find_modes",

@@ -137,7 +137,7 @@ def increments_at(
     tolerance_ns : int
         How far a stamp may lie outside the odometry's span; there the odometry stands still.
     doubts : OdometryDoubts, optional
-        Where the odometry is known less well, see `fusion.odometry_doubts.believed`.
+        Where the odometry is known less well, see `fusion.odometry_doubts.believed_odometry`.
 
     Raises
     ------

@@ -76,7 +76,7 @@ class OdometryDoubts:
         return added
 
 
-def believed(odometry: Trajectory, limits: OdometryLimits) -> tuple[Trajectory, OdometryDoubts]:
+def believed_odometry(odometry: Trajectory, limits: OdometryLimits) -> tuple[Trajectory, OdometryDoubts]:
     """An odometry without the motions that the vehicle cannot have made, and what is doubtful in it.
 
     Across a jump it stands still, so that what follows goes on from where it was. Gaps keep their motion; where it is

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fusion import se2
 from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
-from fusion.odometry_doubts import OdometryDoubts, believed
+from fusion.odometry_doubts import OdometryDoubts, believed_odometry
 from fusion.odometry_limits import OdometryLimits
 from fusion.trajectory import Trajectory
 from sequences.sequence import Sequence
@@ -104,7 +104,7 @@ def load_drive(
     if len(indices) < 2:
         raise SkyfixError(f"{sequence.name}: expected two scans covered by the odometry, got {len(indices)}")
     used = stamps[indices]
-    motion, doubts = believed(odometry, (limits or OdometryLimits()).fitted(odometry))
+    motion, doubts = believed_odometry(odometry, (limits or OdometryLimits()).fitted(odometry))
     return Drive(
         sequence=sequence,
         indices=indices,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from made_drive import EmulatedMatcher, MadeDrive
 
 from fusion import MotionKind, OdometryLimits, OdometryNoise, SkyfixError, Trajectory, increments_at, se2
-from fusion.odometry_doubts import OdometryDoubts, believed
+from fusion.odometry_doubts import OdometryDoubts, believed_odometry
 from fusion.tracking.odometry_buffer import OdometryBuffer, OdometrySample
 from sequences.drive import load_drive
 from sequences.folder import FolderSequence
@@ -53,7 +53,7 @@ def without(odometry: Trajectory, begin: int, end: int) -> Trajectory:
 
 def test_an_odometry_without_faults_is_left_as_it_is():
     odometry = winding(300)
-    motion, doubts = believed(odometry, LIMITS.fitted(odometry))
+    motion, doubts = believed_odometry(odometry, LIMITS.fitted(odometry))
     assert motion is odometry
     assert (len(doubts), str(doubts)) == (0, "nothing doubtful")
     np.testing.assert_array_equal(doubts.between(odometry.stamp_ns), np.zeros((299, 3, 3)))
@@ -63,7 +63,7 @@ def test_an_odometry_without_faults_is_left_as_it_is():
 def test_a_jump_is_taken_out_and_everything_else_stays(delta):
     odometry = winding(300)
     spoiled = jumping(odometry, 120, delta)
-    motion, doubts = believed(spoiled, LIMITS.fitted(spoiled))
+    motion, doubts = believed_odometry(spoiled, LIMITS.fitted(spoiled))
     moved, true = (se2.between(one.poses[:-1], one.poses[1:]) for one in (motion, odometry))
     np.testing.assert_allclose(np.delete(moved, 119, axis=0), np.delete(true, 119, axis=0), atol=1e-9)
     np.testing.assert_allclose(moved[119], 0.0, atol=1e-9)
@@ -76,7 +76,7 @@ def test_a_jump_is_taken_out_and_everything_else_stays(delta):
 
 def test_a_gap_keeps_its_motion_and_costs_certainty_where_it_is():
     spoiled = without(straight_on(300), 100, 140)
-    motion, doubts = believed(spoiled, LIMITS.fitted(spoiled))
+    motion, doubts = believed_odometry(spoiled, LIMITS.fitted(spoiled))
     assert motion is spoiled
     assert doubts.kinds == (MotionKind.GAP,)
     assert doubts.seconds(MotionKind.GAP) == pytest.approx(4.1)
@@ -92,15 +92,15 @@ def test_a_gap_keeps_its_motion_and_costs_certainty_where_it_is():
 def test_a_gap_across_which_a_vehicle_at_speed_has_not_moved_says_that_the_motion_was_missed():
     straight = straight_on(300)
     spoiled = without(jumping(straight, 140, [0.1 - 0.8 * 40, 0.0, 0.0]), 100, 140)  # 0.1 m from the last sample
-    _, doubts = believed(spoiled, LIMITS.fitted(spoiled))
+    _, doubts = believed_odometry(spoiled, LIMITS.fitted(spoiled))
     usual = LIMITS.gap_covariance(4.1)
     half_m = 0.5 * (8.0 * 4.1 - 0.1)
     np.testing.assert_allclose(doubts.covariances[0] - usual, np.diag([half_m**2, half_m**2, 0.0]), atol=1e-9)
     for_real = without(straight, 100, 140)
-    _, doubts = believed(for_real, LIMITS.fitted(for_real))
+    _, doubts = believed_odometry(for_real, LIMITS.fitted(for_real))
     np.testing.assert_allclose(doubts.covariances[0], usual, atol=1e-12)
     stood = np.zeros((300, 3))
-    _, doubts = believed(without(Trajectory(straight.stamp_ns, stood), 100, 140), LIMITS)
+    _, doubts = believed_odometry(without(Trajectory(straight.stamp_ns, stood), 100, 140), LIMITS)
     np.testing.assert_allclose(doubts.covariances[0], usual, rtol=1e-12)
 
 
@@ -111,7 +111,7 @@ def test_a_pose_that_is_repeated_where_a_vehicle_at_speed_cannot_have_stopped_is
         poses[101:141] = poses[100]
         poses[141:] -= 0.0 if catches_up else [0.8 * 40, 0.0, 0.0]
         frozen = Trajectory(straight.stamp_ns, poses, None, "odometry")
-        motion, doubts = believed(frozen, limits)
+        motion, doubts = believed_odometry(frozen, limits)
         np.testing.assert_array_equal(motion.poses, np.delete(poses, range(101, 141), axis=0))
         assert doubts.kinds == (MotionKind.GAP,)
         np.testing.assert_array_equal(doubts.spans_ns, [[100 * TENTH, 141 * TENTH]])
@@ -122,12 +122,15 @@ def test_a_pose_that_is_repeated_where_a_vehicle_at_speed_cannot_have_stopped_is
 def test_a_vehicle_that_brakes_and_stands_is_believed():
     speeds = np.concatenate([np.full(80, 8.0), np.linspace(8.0, 0.0, 25), np.zeros(100), np.linspace(0.0, 8.0, 25)])
     stopping = Trajectory(np.arange(230) * TENTH, np.cumsum(0.1 * speeds)[:, None] * [1.0, 0.0, 0.0], None, "odometry")
-    motion, doubts = believed(stopping, LIMITS.fitted(stopping))
+    motion, doubts = believed_odometry(stopping, LIMITS.fitted(stopping))
     assert motion is stopping
     assert len(doubts) == 0
     poses = stopping.poses.copy()
     poses[40:44] = poses[40]  # three tenths of a second: messages were dropped
-    assert len(believed(Trajectory(stopping.stamp_ns, poses, None, "odometry"), LIMITS.fitted(stopping))[0]) == 230
+    assert (
+        len(believed_odometry(Trajectory(stopping.stamp_ns, poses, None, "odometry"), LIMITS.fitted(stopping))[0])
+        == 230
+    )
 
 
 @pytest.mark.parametrize("inside", [slice(200, 300), slice(0, 100)])
@@ -135,7 +138,7 @@ def test_an_odometry_that_ends_or_begins_frozen_still_covers_its_time(inside):
     straight = straight_on(300)
     poses = straight.poses.copy()
     poses[inside] = poses[inside][0]
-    motion, doubts = believed(Trajectory(straight.stamp_ns, poses, None, "odometry"), LIMITS.fitted(straight))
+    motion, doubts = believed_odometry(Trajectory(straight.stamp_ns, poses, None, "odometry"), LIMITS.fitted(straight))
     assert motion.span_ns == straight.span_ns
     assert doubts.kinds == (MotionKind.GAP,)
     assert doubts.seconds(MotionKind.GAP) == pytest.approx(10.0, abs=0.2)
@@ -152,7 +155,7 @@ def test_a_recording_says_what_the_same_odometry_says_while_it_arrives(gap_at, g
     held = OdometryBuffer(NOISE, LIMITS)
     for stamp, pose in zip(spoiled.stamp_ns.tolist(), spoiled.poses, strict=True):
         held.insert(OdometrySample(stamp, pose))
-    motion, doubts = believed(spoiled, LIMITS)
+    motion, doubts = believed_odometry(spoiled, LIMITS)
     stamps = np.unique([*spoiled.stamp_ns, *(np.array(asked) * TENTH + 17), 119 * TENTH])
     stamps = stamps[stamps <= spoiled.stamp_ns[-1]]
     found = increments_at(stamps, motion, NOISE, doubts=doubts)
@@ -190,7 +193,7 @@ def test_the_end_of_what_nobody_watched_is_known_less_than_a_gap_of_the_same_tim
 
 def test_no_doubts_are_none():
     assert len(OdometryDoubts.none()) == 0
-    assert believed(winding(1), LIMITS)[1].kinds == ()
+    assert believed_odometry(winding(1), LIMITS)[1].kinds == ()
 
 
 @pytest.fixture

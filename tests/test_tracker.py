@@ -91,6 +91,21 @@ def test_temperature_comes_from_the_distance_since_the_last_measurement_also_aft
     assert [m.temperature for arrival in arrivals[1:] for m in arrival.measured] == nearer
 
 
+@pytest.mark.parametrize("estimator", ["filter", "graph", "both"])
+def test_measurements_say_by_how_much_they_agree_with_the_track(estimator):
+    """Against a pose anywhere in what was searched; one that belongs elsewhere says little or less than nothing."""
+    one, gains = Tracker.from_prior(PRIOR, 300, estimator=estimator), []
+    for message in streams(6.0):
+        for arrival in feed(one, [message]):
+            gains += [(m.evidence_gain_nats, m.update.log_evidence) for m in arrival.measured]
+    volume = GRID.area_m2 * 2.0 * np.pi  # of a Gaussian, everything
+    assert [gain for gain, _ in gains] == pytest.approx([evidence + np.log(volume) for _, evidence in gains])
+    assert np.median([gain for gain, _ in gains]) > 3.0
+    elsewhere = measurement(one.newest_ns, np.random.default_rng(0), np.array([-100.0, -100.0, 0.0]))
+    (wrong,) = one.add_likelihood(one.newest_ns, elsewhere).measured
+    assert wrong.evidence_gain_nats < 2.0  # a graph takes clutter to be denser
+
+
 def test_a_kidnapped_vehicle_is_lost_says_so_and_is_found():
     one = tracker(1000)
     feed(one, streams(4.0))

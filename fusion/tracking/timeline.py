@@ -9,6 +9,7 @@ snapshot before it, with the result that it would have had in time.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import log
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.likelihood import PoseLikelihood
 from fusion.odometry import OdometryIncrement, accumulate
+from fusion.pose_filter import UpdateReport
 from fusion.tracking.archive import Tree
 from fusion.tracking.history import History, Node, history_from_tree
 from fusion.tracking.likelihood_buffer import LikelihoodBuffer
@@ -220,14 +222,14 @@ class Timeline:
         """Weigh the filter; errors that this measurement repeats are flattened for."""
         length = self._settings.correlation_length_m
         if length == 0.0:
-            return Measured(stamp_ns, 1.0, self.filter.update(likelihood)), memory
+            return _measured(stamp_ns, 1.0, self.filter.update(likelihood), likelihood), memory
         correlation = 0.0 if distance is None else error_correlation(distance, length)
         before = self.filter.estimate(stamp_ns).covariance
         temperature = memory.temperature(correlation, before)
         update = self.filter.update(likelihood, temperature)
         if update.used:
             memory = memory.after(correlation, temperature, before, self.filter.estimate(stamp_ns).covariance)
-        return Measured(stamp_ns, temperature, update), memory
+        return _measured(stamp_ns, temperature, update, likelihood), memory
 
     def _move(self, node: Node, stamp_ns: int, key_ns: int, stream: int = _NODE_STREAM) -> float | None:
         """Reseed the filter and move it from a node to a stamp; the distance since the last measurement then."""
@@ -252,3 +254,7 @@ class Timeline:
         if stamp_ns > covered_ns:
             pieces.append(self.odometry.extrapolated(stamp_ns))
         return accumulate(pieces) if pieces else None
+
+
+def _measured(stamp_ns: int, temperature: float, update: UpdateReport, likelihood: PoseLikelihood) -> Measured:
+    return Measured(stamp_ns, temperature, update, update.log_evidence + log(likelihood.searched_volume))
