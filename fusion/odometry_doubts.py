@@ -18,6 +18,7 @@ from fusion.trajectory import Trajectory
 
 _FROZEN_M_PER_S = 1e-3
 _HARDEST_M_PER_S2 = 10.0  # braking of a car on a dry road
+_STOPPING_S, _COARSE_M = 0.5, 0.5  # looked at beside a standstill; wheels tell the way in steps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,11 +89,12 @@ def believed_odometry(odometry: Trajectory, limits: OdometryLimits) -> tuple[Tra
     odometry : Trajectory
         As it comes.
     limits : OdometryLimits
-        What the vehicle can do; see `OdometryLimits.fitted`.
+        What the vehicle can do; they are fitted to the odometry, see `OdometryLimits.fitted`.
     """
-    odometry = _thawed(odometry, limits)
+    odometry = _thawed(odometry, limits.gap_s)
     if len(odometry) < 2:
         return odometry, OdometryDoubts.none()
+    limits = limits.fitted(odometry)
     deltas = se2.between(odometry.poses[:-1], odometry.poses[1:])
     seconds = 1e-9 * np.diff(odometry.stamp_ns)
     kinds = [limits.kind(delta, time) for delta, time in zip(deltas, seconds.tolist(), strict=True)]
@@ -114,21 +116,29 @@ def believed_odometry(odometry: Trajectory, limits: OdometryLimits) -> tuple[Tra
     return Trajectory(odometry.stamp_ns, poses, None, odometry.frame_id), doubts
 
 
-def _thawed(odometry: Trajectory, limits: OdometryLimits) -> Trajectory:
-    """Without the samples that repeat a pose at which the vehicle cannot have stood."""
+def _thawed(odometry: Trajectory, longest_s: float) -> Trajectory:
+    """Without the samples that repeat a pose for long at which the vehicle cannot have stood."""
     seconds = 1e-9 * np.diff(odometry.stamp_ns)
-    speeds = np.linalg.norm(np.diff(odometry.poses[:, :2], axis=0), axis=1) / seconds
-    frozen = np.concatenate([[False], speeds < _FROZEN_M_PER_S, [False]])  # of the step into a sample
+    lengths = np.linalg.norm(np.diff(odometry.poses[:, :2], axis=0), axis=1)
+    frozen = np.concatenate([[False], lengths < _FROZEN_M_PER_S * seconds, [False]])  # of the step into a sample
     kept = np.ones(len(odometry), dtype=bool)
     for first, last in np.flatnonzero(np.diff(frozen)).reshape(-1, 2).tolist():  # samples first to last are alike
-        beside = [step for step in (first - 1, last) if 0 <= step < len(speeds)]
-        hardest = max((float(speeds[step] / seconds[step]) for step in beside), default=0.0)
-        if seconds[first:last].sum() > limits.gap_s and hardest > _HARDEST_M_PER_S2:
+        if seconds[first:last].sum() <= longest_s:
+            continue
+        before, after = slice(first - 1, None, -1) if first else slice(0, 0), slice(last, None)
+        if any(_is_too_hard(lengths[side], seconds[side]) for side in (before, after)):
             kept[first + 1 : last + 1] = False
     kept[-1] = True
     if kept.all():
         return odometry
     return Trajectory(odometry.stamp_ns[kept], odometry.poses[kept], None, odometry.frame_id)
+
+
+def _is_too_hard(lengths: FloatArray, seconds: FloatArray) -> bool:
+    """Whether no vehicle can stand at the beginning of steps that are this long, or at their end in reverse order."""
+    count = int(np.searchsorted(np.cumsum(seconds), _STOPPING_S)) + 1
+    most_m = 0.5 * _HARDEST_M_PER_S2 * float(seconds[:count].sum()) ** 2 + _COARSE_M
+    return float(lengths[:count].sum()) > most_m
 
 
 def _missing_m(deltas: FloatArray, seconds: FloatArray, kinds: list[MotionKind], gap: int) -> float:

@@ -104,7 +104,7 @@ def load_drive(
     if len(indices) < 2:
         raise SkyfixError(f"{sequence.name}: expected two scans covered by the odometry, got {len(indices)}")
     used = stamps[indices]
-    motion, doubts = believed_odometry(odometry, (limits or OdometryLimits()).fitted(odometry))
+    motion, doubts = believed_odometry(odometry, limits or OdometryLimits())
     return Drive(
         sequence=sequence,
         indices=indices,

@@ -53,7 +53,7 @@ def without(odometry: Trajectory, begin: int, end: int) -> Trajectory:
 
 def test_an_odometry_without_faults_is_left_as_it_is():
     odometry = winding(300)
-    motion, doubts = believed_odometry(odometry, LIMITS.fitted(odometry))
+    motion, doubts = believed_odometry(odometry, LIMITS)
     assert motion is odometry
     assert (len(doubts), str(doubts)) == (0, "nothing doubtful")
     np.testing.assert_array_equal(doubts.between(odometry.stamp_ns), np.zeros((299, 3, 3)))
@@ -63,7 +63,7 @@ def test_an_odometry_without_faults_is_left_as_it_is():
 def test_a_jump_is_taken_out_and_everything_else_stays(delta):
     odometry = winding(300)
     spoiled = jumping(odometry, 120, delta)
-    motion, doubts = believed_odometry(spoiled, LIMITS.fitted(spoiled))
+    motion, doubts = believed_odometry(spoiled, LIMITS)
     moved, true = (se2.between(one.poses[:-1], one.poses[1:]) for one in (motion, odometry))
     np.testing.assert_allclose(np.delete(moved, 119, axis=0), np.delete(true, 119, axis=0), atol=1e-9)
     np.testing.assert_allclose(moved[119], 0.0, atol=1e-9)
@@ -76,7 +76,7 @@ def test_a_jump_is_taken_out_and_everything_else_stays(delta):
 
 def test_a_gap_keeps_its_motion_and_costs_certainty_where_it_is():
     spoiled = without(straight_on(300), 100, 140)
-    motion, doubts = believed_odometry(spoiled, LIMITS.fitted(spoiled))
+    motion, doubts = believed_odometry(spoiled, LIMITS)
     assert motion is spoiled
     assert doubts.kinds == (MotionKind.GAP,)
     assert doubts.seconds(MotionKind.GAP) == pytest.approx(4.1)
@@ -92,12 +92,12 @@ def test_a_gap_keeps_its_motion_and_costs_certainty_where_it_is():
 def test_a_gap_across_which_a_vehicle_at_speed_has_not_moved_says_that_the_motion_was_missed():
     straight = straight_on(300)
     spoiled = without(jumping(straight, 140, [0.1 - 0.8 * 40, 0.0, 0.0]), 100, 140)  # 0.1 m from the last sample
-    _, doubts = believed_odometry(spoiled, LIMITS.fitted(spoiled))
+    _, doubts = believed_odometry(spoiled, LIMITS)
     usual = LIMITS.gap_covariance(4.1)
     half_m = 0.5 * (8.0 * 4.1 - 0.1)
     np.testing.assert_allclose(doubts.covariances[0] - usual, np.diag([half_m**2, half_m**2, 0.0]), atol=1e-9)
     for_real = without(straight, 100, 140)
-    _, doubts = believed_odometry(for_real, LIMITS.fitted(for_real))
+    _, doubts = believed_odometry(for_real, LIMITS)
     np.testing.assert_allclose(doubts.covariances[0], usual, atol=1e-12)
     stood = np.zeros((300, 3))
     _, doubts = believed_odometry(without(Trajectory(straight.stamp_ns, stood), 100, 140), LIMITS)
@@ -105,13 +105,13 @@ def test_a_gap_across_which_a_vehicle_at_speed_has_not_moved_says_that_the_motio
 
 
 def test_a_pose_that_is_repeated_where_a_vehicle_at_speed_cannot_have_stopped_is_a_gap():
-    straight, limits = straight_on(300), LIMITS.fitted(straight_on(300))
+    straight = straight_on(300)
     for catches_up in (True, False):
         poses = straight.poses.copy()
         poses[101:141] = poses[100]
         poses[141:] -= 0.0 if catches_up else [0.8 * 40, 0.0, 0.0]
         frozen = Trajectory(straight.stamp_ns, poses, None, "odometry")
-        motion, doubts = believed_odometry(frozen, limits)
+        motion, doubts = believed_odometry(frozen, LIMITS)
         np.testing.assert_array_equal(motion.poses, np.delete(poses, range(101, 141), axis=0))
         assert doubts.kinds == (MotionKind.GAP,)
         np.testing.assert_array_equal(doubts.spans_ns, [[100 * TENTH, 141 * TENTH]])
@@ -119,18 +119,54 @@ def test_a_pose_that_is_repeated_where_a_vehicle_at_speed_cannot_have_stopped_is
         assert (spread_m < 4.0) if catches_up else (spread_m > 16.0)  # of the 33 m that it drove
 
 
+def along(speeds: np.ndarray, hertz: float, step_m: float = 0.0) -> Trajectory:
+    """Straight on at speeds, told in steps of a length."""
+    way = np.cumsum(speeds / hertz)
+    way = np.floor(way / step_m) * step_m if step_m else way
+    stamps = np.round(np.arange(len(speeds)) * SECOND / hertz).astype(np.int64)
+    return Trajectory(stamps, way[:, None] * [1.0, 0.0, 0.0], None, "odometry")
+
+
+ORDINARY = {
+    "a robot, in steps of 1 cm": along(np.full(2400, 0.3), 20.0, 0.01),
+    "a robot, in steps of 10 cm": along(np.full(2400, 0.3), 20.0, 0.1),
+    "stop and go at 50 Hz, in steps of 10 cm": along(
+        np.maximum(0.0, 5.0 + 5.0 * np.sin(np.arange(6000) / 400)), 50, 0.1
+    ),
+    "braked hard, in steps of 1 cm": along(np.clip(10.0 - 0.12 * np.arange(1000), 0.0, 10.0), 50.0, 0.01),
+    "a robot that stops dead": along(np.repeat([0.8, 0.0, 0.8], 1000), 50.0),
+    "one pose a second": along(np.maximum(0.0, 8.0 + 8.0 * np.sin(np.arange(300) / 15)), 1.0),
+    "one pose a second told ten times": along(np.full(600, 10.0), 10.0, 10.0),
+    "reversing": along(2.0 * np.cos(np.arange(600) / 50), 10.0),
+    "standing": along(np.zeros(100), 10.0),
+}
+
+
+@pytest.mark.parametrize("name", ORDINARY)
+def test_an_odometry_that_is_only_coarse_slow_or_halting_is_believed(name):
+    motion, doubts = believed_odometry(ORDINARY[name], LIMITS)
+    assert str(doubts) == "nothing doubtful"
+    moved = motion.interpolate(ORDINARY[name].stamp_ns)[:, 0] - ORDINARY[name].poses[:, 0]
+    assert np.abs(moved).max() <= (10.0 if "ten times" in name else 0.0)  # which is interpolated between its poses
+
+
+@given(st.floats(0.0, 0.3), st.integers(0, 2**32 - 1))
+def test_noise_at_a_standstill_is_no_jump(sigma_m, seed):
+    speeds = np.repeat([0.0, 8.0, 0.0], [800, 100, 100])
+    poses = along(speeds, 10.0).poses + np.random.default_rng(seed).normal(0.0, 0.3 * sigma_m, (1000, 3)) * [1, 1, 0]
+    _, doubts = believed_odometry(Trajectory(np.arange(1000) * TENTH, poses, None, "odometry"), LIMITS)
+    assert doubts.count(MotionKind.RESET) == 0
+
+
 def test_a_vehicle_that_brakes_and_stands_is_believed():
     speeds = np.concatenate([np.full(80, 8.0), np.linspace(8.0, 0.0, 25), np.zeros(100), np.linspace(0.0, 8.0, 25)])
     stopping = Trajectory(np.arange(230) * TENTH, np.cumsum(0.1 * speeds)[:, None] * [1.0, 0.0, 0.0], None, "odometry")
-    motion, doubts = believed_odometry(stopping, LIMITS.fitted(stopping))
+    motion, doubts = believed_odometry(stopping, LIMITS)
     assert motion is stopping
     assert len(doubts) == 0
     poses = stopping.poses.copy()
     poses[40:44] = poses[40]  # three tenths of a second: messages were dropped
-    assert (
-        len(believed_odometry(Trajectory(stopping.stamp_ns, poses, None, "odometry"), LIMITS.fitted(stopping))[0])
-        == 230
-    )
+    assert len(believed_odometry(Trajectory(stopping.stamp_ns, poses, None, "odometry"), LIMITS)[0]) == 230
 
 
 @pytest.mark.parametrize("inside", [slice(200, 300), slice(0, 100)])
@@ -138,7 +174,7 @@ def test_an_odometry_that_ends_or_begins_frozen_still_covers_its_time(inside):
     straight = straight_on(300)
     poses = straight.poses.copy()
     poses[inside] = poses[inside][0]
-    motion, doubts = believed_odometry(Trajectory(straight.stamp_ns, poses, None, "odometry"), LIMITS.fitted(straight))
+    motion, doubts = believed_odometry(Trajectory(straight.stamp_ns, poses, None, "odometry"), LIMITS)
     assert motion.span_ns == straight.span_ns
     assert doubts.kinds == (MotionKind.GAP,)
     assert doubts.seconds(MotionKind.GAP) == pytest.approx(10.0, abs=0.2)
@@ -152,7 +188,7 @@ def test_an_odometry_that_ends_or_begins_frozen_still_covers_its_time(inside):
 )
 def test_a_recording_says_what_the_same_odometry_says_while_it_arrives(gap_at, gap_length, jump_at, asked):
     spoiled = without(jumping(winding(120), jump_at, [-40.0, 3.0, 1.0]), gap_at, min(gap_at + gap_length, 65))
-    held = OdometryBuffer(NOISE, LIMITS)
+    held = OdometryBuffer(NOISE, LIMITS.fitted(spoiled))
     for stamp, pose in zip(spoiled.stamp_ns.tolist(), spoiled.poses, strict=True):
         held.insert(OdometrySample(stamp, pose))
     motion, doubts = believed_odometry(spoiled, LIMITS)
