@@ -53,9 +53,10 @@ class Drive:
 
     @property
     def length_m(self) -> float:
-        """Path length of the truth, or of the odometry where it does not cover all frames."""
-        whole = self.truth is not None and len(self.truth) == len(self.indices)
-        return self.truth.length_m if self.truth is not None and whole else self.odometry.length_m
+        """Path length of the truth, or of the odometry without its jumps where it does not cover all frames."""
+        if self.truth is not None and len(self.truth) == len(self.indices):
+            return self.truth.length_m
+        return _at(self.motion, self.stamps_ns).length_m
 
     def true_pose(self, frame: int) -> FloatArray | None:
         """True pose (3,) at a frame, None where there is no truth."""

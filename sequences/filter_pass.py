@@ -81,6 +81,7 @@ class FilterPass:
         self.snapshots: list[Snapshot] = []
         self.log: list[str] = []
         self._drive, self._increments, self._matcher = drive, increments, matcher
+        self._way_m = sum(float(np.hypot(*increment.delta[:2])) for increment in increments)
         self._prior, self._settings = prior, settings
         given = settings.correlation_length_m
         self._correlation_m = error_correlation_length_m(matcher, drive.sequence.map) if given is None else given
@@ -290,7 +291,7 @@ class FilterPass:
         self.best[frame] = measurement.best_pose()
         self._measured_at_m, self._since_measured, self._unknown_m2 = self._travelled_m, [], 0.0
         kept, wanted = len(self.snapshots), self._settings.snapshots
-        if kept < wanted and self._travelled_m >= kept * self._drive.odometry.length_m / wanted:
+        if kept < wanted and self._travelled_m >= kept * self._way_m / wanted:
             sequence = self._drive.sequence
             self.snapshots.append(
                 take_snapshot(

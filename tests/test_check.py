@@ -173,6 +173,10 @@ def test_the_command_prints_all_and_draws(
     lines = finished.out.splitlines()
     assert lines[:-1] == [f"{one.level:<8} {one.subject}: {one.text}" for one in told(made)]
     assert picture.read_bytes().startswith(b"\x89PNG")
+    PROBLEMS["odometry of another clock"][0](made)
+    finished = skyfix(capsys, monkeypatch, "check", str(made.path), "--picture", str(picture))
+    assert (finished.code, finished.err) == (1, "")
+    write_tum(made.path / "odometry" / "wheels.tum", made.odometry)
     (made.path / "ground_truth.tum").unlink()
     finished = skyfix(capsys, monkeypatch, "check", str(made.path), "--picture", str(picture))
     assert finished.code == 0

@@ -255,6 +255,11 @@ def test_a_drive_is_tracked_across_a_jump_of_its_odometry(long_steps, tmp_path):
         mean = {name: result.metrics[method]["position_error_m"]["mean"] for name, result in results.items()}
         assert mean["limited"] < mean["plain"] + 0.3
     result = results["limited"]
+    assert len(result.snapshots) == len(results["plain"].snapshots)
+    untold = replace(settings, start=tuple(made.truth.poses[0] * [1.0, 1.0, 180.0 / np.pi]))
+    (made.path / "ground_truth.tum").unlink()
+    unscored = track(FolderSequence(made.path), EmulatedMatcher(made.truth.poses), untold)
+    assert unscored.length_m == pytest.approx(made.odometry.length_m, rel=0.1)  # 40 m of 60 were none
     assert result.metrics["odometry"]["position_error_m"]["max"] > 30.0  # odometry only is shown as it comes
     assert result.metrics["odometry_doubts"] == {"jumps": 1, "gaps": 0, "gap_seconds": 0.0}
     report = write_run(result, tmp_path / "run")

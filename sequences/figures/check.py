@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusion import se2
 from fusion.arrays import FloatArray
+from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
 from sequences.drive import STAMP_TOLERANCE_NS, load_drive
 from sequences.figures.map_drawing import draw_map, north_arrow, scale_bar
@@ -57,10 +58,8 @@ def _draw_paths(axes: Axes, sequence: Sequence, truth: Trajectory | None) -> Non
         style = METHODS["truth"]
         axes.plot(*truth.poses[:, :2].T, style.line, lw=style.width, color=style.colour, label=style.label, zorder=3)
         for number, name in enumerate(sequence.odometry_names):
-            drive = load_drive(sequence, name)
-            moved = None if drive.truth is None else scored(drive.truth, drive.odometry)
-            if drive.truth is not None and moved is not None:
-                path = from_true_start(drive.truth, moved).poses
+            path = _from_truth(sequence, name)
+            if path is not None:
                 dashes = _DASHES[number % len(_DASHES)]
                 axes.plot(*path[:, :2].T, ls=dashes, lw=1.6, color=METHODS["odometry"].colour, label=name, zorder=5)
         axes.plot(*truth.poses[0, :2], "o", ms=7, mfc="white", mec=INK, mew=1.4, zorder=12)
@@ -70,6 +69,16 @@ def _draw_paths(axes: Axes, sequence: Sequence, truth: Trajectory | None) -> Non
     axes.set_aspect("equal")
     scale_bar(axes)
     north_arrow(axes)
+
+
+def _from_truth(sequence: Sequence, name: str) -> FloatArray | None:
+    """An odometry (N, 3) begun at the true pose; None where it is not of the same time, or cannot be read."""
+    try:
+        drive = load_drive(sequence, name)
+    except SkyfixError:
+        return None
+    moved = None if drive.truth is None else scored(drive.truth, drive.odometry)
+    return None if drive.truth is None or moved is None else from_true_start(drive.truth, moved).poses
 
 
 def _title(truth: Trajectory | None) -> str:
