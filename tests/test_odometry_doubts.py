@@ -99,6 +99,10 @@ def test_a_gap_across_which_a_vehicle_at_speed_has_not_moved_says_that_the_motio
     for_real = without(straight, 100, 140)
     _, doubts = believed_odometry(for_real, LIMITS)
     np.testing.assert_allclose(doubts.covariances[0], usual, atol=1e-12)
+    braking = np.cumsum(np.repeat([0.8, 0.01], [100, 200]))[:, None] * [1.0, 0.0, 0.0]  # it creeps from the gap on
+    _, doubts = believed_odometry(without(Trajectory(straight.stamp_ns, braking), 100, 140), LIMITS)
+    half_m = 0.5 * (0.5 * (8.0 + 0.1) * 4.1 - 0.41)
+    assert doubts.covariances[0, 0, 0] - usual[0, 0] == pytest.approx(half_m**2)
     stood = np.zeros((300, 3))
     _, doubts = believed_odometry(without(Trajectory(straight.stamp_ns, stood), 100, 140), LIMITS)
     np.testing.assert_allclose(doubts.covariances[0], usual, rtol=1e-12)
@@ -137,6 +141,7 @@ ORDINARY = {
     "a robot that stops dead": along(np.repeat([0.8, 0.0, 0.8], 1000), 50.0),
     "one pose a second": along(np.maximum(0.0, 8.0 + 8.0 * np.sin(np.arange(300) / 15)), 1.0),
     "one pose a second told ten times": along(np.full(600, 10.0), 10.0, 10.0),
+    "a robot that stops dead from 3 m/s": along(np.repeat([3.0, 0.0, 3.0], 100), 10.0),
     "reversing": along(2.0 * np.cos(np.arange(600) / 50), 10.0),
     "standing": along(np.zeros(100), 10.0),
 }

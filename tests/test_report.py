@@ -14,7 +14,7 @@ import pytest
 from made_run import SIGMA, made_run
 
 from fusion.trajectory import Trajectory
-from sequences.figures import frames_figure, series_of
+from sequences.figures import frames_figure, series_of, trajectories_figure
 from sequences.figures.frames import bev_picture, covariance_ellipse
 from sequences.figures.map_drawing import round_length
 from sequences.report import write_report
@@ -233,3 +233,17 @@ def test_scale_bars_are_round(target: float, expected: float) -> None:
 
 def test_a_scan_that_hits_nothing_is_blank_paper() -> None:
     assert (bev_picture(np.zeros((3, 8, 8), dtype=np.float32)) == 255).all()
+
+
+def test_the_worst_moment_is_one_that_the_truth_covers() -> None:
+    whole = made_run(frames=120)
+    assert whole.truth is not None
+    part = replace(whole, truth=whole.truth.within(int(whole.stamps_ns[60]), int(whole.stamps_ns[79])))
+    series = series_of(part)
+    figure = trajectories_figure(part, series)
+    (axes,) = [each for each in figure.axes if "Worst after the first quarter" in each.get_title(loc="left")]
+    errors = series.errors["filter"].position_m
+    assert len(errors) == 20
+    assert f"{errors.max():.2f} m" in axes.get_title(loc="left")
+    centre = np.mean([axes.get_xlim(), axes.get_ylim()], axis=1)
+    np.testing.assert_allclose(centre, whole.filter.poses[60 + int(errors.argmax()), :2])

@@ -21,7 +21,7 @@ from sequences.registry import OpenOptions
 from sequences.run_files import read_metrics
 from sequences.sweep import sweep
 from sequences.sweep_plan import SweepOptions, plan_runs
-from sequences.sweep_tables import markdown
+from sequences.sweep_tables import markdown, write_sweep
 from sequences.track_settings import TrackSettings
 from sequences.trajectory_io import write_tum
 
@@ -108,6 +108,22 @@ def test_tables_are_of_what_the_runs_hold(swept: Path) -> None:
     ]
     assert lines == expected
     assert (swept / "sweep.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_a_run_lacks_is_left_out_and_what_it_doubts_is_told(made: MadeDrive, swept: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(swept, tmp_path / "out")
+    runs = plan_runs([made.path], GRID, out)
+    spoiled = next(run for run in runs if run.settings.seed == 1 and run.settings.particles == 300)
+    metrics = read_metrics(spoiled.folder)
+    del metrics["single_shot"]
+    metrics["trust"]["doubts"] = ["lost for 9 of 30 frames"]
+    (spoiled.folder / "metrics.json").write_text(json.dumps(metrics))
+    write_sweep(out, runs, {})
+    text = (out / "sweep.md").read_text()
+    assert "| single shot | rotmatch, particles 600 |" in text
+    assert "| single shot | rotmatch, particles 300 |" not in text
+    assert "| filter | rotmatch, particles 300 |" in text
+    assert "- rotmatch, particles 300, seed 1: doubtful: lost for 9 of 30 frames\n" in text
 
 
 def test_what_is_there_is_not_tracked_again(
