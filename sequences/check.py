@@ -83,7 +83,9 @@ def check(sequence: Sequence, matcher: MapMatcher | None = None) -> list[Finding
     findings = [*_scans(sequence, scans, unusable), *_ground(sequence, list(scans.values())), _map(sequence)]
     truth = sequence.ground_truth
     if truth is None:
-        findings.append(Finding(Level.NOTE, "ground truth", "none: errors will not be known, tracking needs --start"))
+        findings.append(
+            Finding(Level.NOTE, "ground truth", "none: errors will not be known; give --start or --start-anywhere")
+        )
     else:
         findings += _truth(sequence, truth)
     for name in sequence.odometry_names:
