@@ -99,9 +99,9 @@ def track(
         list[str] | None,
         typer.Option(
             "--set",
-            help="Change a setting of the search, the filter, the smoother or the odometry's noise, as in "
-            "filter.resampler=stratified; may be repeated. A run's config.yaml lists them all.",
-            metavar="GROUP.KEY=VALUE",
+            help="Change any setting that a run's config.yaml lists, as in filter.resampler=stratified or "
+            "limits.gap_s=2; may be repeated.",
+            metavar="KEY=VALUE",
         ),
     ] = None,
     allow_pickle: PickleOption = False,
@@ -115,7 +115,7 @@ def track(
     from sequences.dotted_keys import changed
     from sequences.registry import OpenOptions, open_sequence
     from sequences.run_files import doubts_of, read_calibration
-    from sequences.track_settings import GROUPS, TrackSettings
+    from sequences.track_settings import SETTABLE, TrackSettings
 
     opened = open_sequence(sequence, OpenOptions(seed, allow_pickle))
     for doubt in doubts_of(calibration) if calibration is not None else ():
@@ -135,7 +135,7 @@ def track(
         map_check_every_m=watch_map_every,
         calibration=None if calibration is None else read_calibration(calibration),
     )
-    _run(opened, matcher, changed(settings, override or (), GROUPS), out, overwrite, quiet, backend)
+    _run(opened, matcher, changed(settings, override or (), SETTABLE), out, overwrite, quiet, backend)
 
 
 def view(run: Annotated[Path, typer.Argument(help="Run directory.", metavar="RUN")]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,7 @@ from sequences.dotted_keys import as_overrides, changed, split_override
 from sequences.registry import OpenOptions, open_sequence
 from sequences.sequence import Sequence as Drive
 from sequences.sequence import odometry_is_emulated
-from sequences.track_settings import TrackSettings
-
-SWEPT = tuple(entry.name for entry in fields(TrackSettings) if entry.name not in ("odometry", "seed", "calibration"))
-"""Fields of the settings that may be swept; odometries and seeds have options of their own."""
+from sequences.track_settings import SETTABLE, TrackSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +113,7 @@ def plan_runs(drives: Sequence[Path], options: SweepOptions, out_dir: Path) -> l
     runs = []
     for seed, (path, name, odometry) in itertools.product(options.seeds, tracks):
         for matcher, changes in itertools.product(options.matchers, combinations):
-            settings = changed(TrackSettings(odometry, seed), as_overrides(changes), SWEPT)
+            settings = changed(TrackSettings(odometry, seed), as_overrides(changes), SETTABLE)
             swept = {key: value for key, value in changes.items() if any(each[key] != value for each in combinations)}
             parts = [name, odometry, matcher_label(matcher), *(f"{key}-{_shown(swept[key])}" for key in swept)]
             folder = out_dir / "runs" / _slug("-".join(parts)) / f"seed-{seed}"

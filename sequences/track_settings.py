@@ -13,9 +13,6 @@ from fusion.odometry_limits import OdometryLimits
 from fusion.particle_filter import ParticleFilterSettings
 from sequences.search_settings import SearchSettings
 
-GROUPS = ("search", "filter", "smoother", "noise", "limits")
-"""Fields of `TrackSettings` that hold settings of their own."""
-
 
 @dataclass(frozen=True, slots=True)
 class TrackSettings:
@@ -122,3 +119,7 @@ class TrackSettings:
     def half_heading_rad(self) -> float:
         """Half width of the start's headings, radians."""
         return math.radians(self.half_heading_deg)
+
+
+SETTABLE = tuple(entry.name for entry in fields(TrackSettings) if entry.name not in ("odometry", "seed", "calibration"))
+"""Fields that `--set` changes; the others have options of their own."""

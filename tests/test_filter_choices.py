@@ -14,13 +14,13 @@ from sequences.dotted_keys import changed
 from sequences.folder import FolderSequence
 from sequences.localize import track
 from sequences.run_result import RunResult
-from sequences.track_settings import GROUPS, TrackSettings
+from sequences.track_settings import SETTABLE, TrackSettings
 
 SETTINGS = TrackSettings("wheels", seed=3, particles=3000)
 
 
 def with_choices(settings: TrackSettings, *overrides: str) -> TrackSettings:
-    return changed(settings, overrides, GROUPS)
+    return changed(settings, overrides, SETTABLE)
 
 
 def run(made: MadeDrive, *overrides: str) -> RunResult:

@@ -241,7 +241,7 @@ def test_the_worst_moment_is_one_that_the_truth_covers() -> None:
     part = replace(whole, truth=whole.truth.within(int(whole.stamps_ns[20]), int(whole.stamps_ns[79])))
     series = series_of(part)
     figure = trajectories_figure(part, series)
-    (axes,) = [each for each in figure.axes if "Worst after the first quarter" in each.get_title(loc="left")]
+    (axes,) = [each for each in figure.axes if "Worst after a quarter" in each.get_title(loc="left")]
     errors, settled = series.errors["filter"].position_m, series.distance_m[20:80] >= 0.25 * series.distance_m[-1]
     assert (len(errors), settled[0], settled[-1]) == (60, False, True)
     worst = np.where(settled, errors, 0.0)

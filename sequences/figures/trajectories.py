@@ -107,10 +107,10 @@ def _worst_box(result: RunResult, series: RunSeries) -> tuple[Box, str]:
     if errors is not None and known is not None and (errors.distance_m >= settled_m).any():
         after = errors.distance_m >= settled_m
         poses, off_m = known.poses[after], errors.position_m[after]
-        at, title = int(off_m.argmax()), f"Worst after the first quarter: {off_m.max():.2f} m"
+        at, title = int(off_m.argmax()), f"Worst after a quarter: {off_m.max():.2f} m"
     elif result.filter.covariances is not None:
         spread = np.trace(result.filter.covariances[-len(poses) :, :2, :2], axis1=1, axis2=2)
-        at, title = int(spread.argmax()), "Least sure after the first quarter"
+        at, title = int(spread.argmax()), "Least sure after a quarter"
     else:
         at, title = len(poses) - 1, "The end"
     x, y = (float(value) for value in poses[at, :2])
