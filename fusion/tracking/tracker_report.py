@@ -81,7 +81,7 @@ class Statistics:
     odometry, likelihoods : int
         Messages taken in, those waiting included.
     late_odometry, late_likelihoods : int
-        Of these, how many came after newer ones of their kind had been used.
+        Of these, how many came after newer odometry, or after the filter had stepped to their time or beyond.
     too_late_odometry, too_late_likelihoods : int
         Messages older than the history.
     duplicates, conflicts : int
