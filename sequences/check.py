@@ -31,7 +31,7 @@ SCANS_LOOKED_AT = 8
 _NEAR_SIGHTED_M = 15.0
 _GROUND_TOLERANCE_M = 0.3
 _COURSE_STEP_M, _COURSE_LEAST, _COURSE_OFF_RAD, _COURSE_SPREAD = 2.0, 5, np.deg2rad(15.0), 0.8
-_SCALE_OFF = 0.1
+_SCALE_OFF, _SHORT_M = 0.1, 10.0
 _MANY_JUMPS = 0.05  # of an odometry's samples
 _LEAST_TURN_RAD = 0.5
 _FEWEST_RIGHT, _RIGHT_M = 0.5, 3.0
@@ -193,7 +193,11 @@ def _odometry(sequence: Sequence, name: str) -> list[Finding]:
 
 def _against_truth(subject: str, truth: Trajectory, odometry: Trajectory) -> list[Finding]:
     """Scale, sense of turning and drift of odometry (stamps of `truth`)."""
-    ratio = odometry.length_m / max(truth.length_m, 1e-9)
+    if truth.length_m < _SHORT_M:
+        text = f"{odometry.length_m:.1f} m where the truth is {truth.length_m:.1f} m long"
+        fits = odometry.length_m < 2.0 * _SHORT_M
+        return [Finding(Level.OK if fits else Level.PROBLEM, subject, text)]
+    ratio = odometry.length_m / truth.length_m
     off_m = position_errors(truth.poses, from_true_start(truth, odometry).poses)
     drift = f"begun at the true pose {off_m.mean():.1f} m off on average, {off_m[-1]:.1f} m at the end"
     text = f"{ratio:.3f} of the true length; {drift}"

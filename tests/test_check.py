@@ -133,6 +133,11 @@ PROBLEMS: dict[str, tuple[Spoil, str, str]] = {
         "ground truth",
         "headings do not follow the path",
     ),
+    "truth that stands still": (
+        rewritten(moved(lambda poses: 0.0 * poses), truth=True),
+        "odometry wheels",
+        "59.7 m where the truth is 0.0 m long",
+    ),
     "scans of another clock": (other_stamps, "odometry wheels", "expected an overlap in time"),
 }
 
