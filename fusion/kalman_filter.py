@@ -200,7 +200,8 @@ def _sum(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _mean(poses: FloatArray, weights: FloatArray) -> FloatArray:
-    """Weighted mean (3,) of poses (N, 3); a weight may be negative, the resultant of the headings never vanishes."""
+    """Weighted mean (3,) of poses (N, 3), headings by the short way from the first: with weights below zero the
+    resultant of widely spread ones points the other way."""
     mean = weights @ poses
-    mean[2] = np.arctan2(weights @ np.sin(poses[:, 2]), weights @ np.cos(poses[:, 2]))
+    mean[2] = se2.wrap(poses[0, 2] + weights @ se2.wrap(poses[:, 2] - poses[0, 2]))
     return np.asarray(mean)

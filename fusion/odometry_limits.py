@@ -104,9 +104,13 @@ class OdometryLimits:
         known = min(seconds, self.clock_jump_s)
         return self._gap_variances(known * (1.0 + (known / self.gap_growth_s) ** 2))
 
-    def beyond_covariance(self, seconds: float) -> FloatArray:
-        """Covariance (3, 3) that a time adds at whose end there is no odometry."""
-        return self._gap_variances(seconds * (1.0 + _OPEN_END * (seconds / self.gap_growth_s) ** 2))
+    def beyond_covariance(self, seconds: float, velocity_over_s: float = 0.0) -> FloatArray:
+        """Covariance (3, 3) that a time adds at whose end there is no odometry.
+
+        The velocity at its beginning is known, or only its mean over a time before.
+        """
+        growth = _OPEN_END * seconds * (seconds + velocity_over_s) / self.gap_growth_s**2
+        return self._gap_variances(seconds * (1.0 + growth))
 
     def added_covariance(self, kind: MotionKind, seconds: float) -> FloatArray:
         """Covariance (3, 3) that a motion of some kind has besides the odometry's noise."""

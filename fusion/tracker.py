@@ -70,7 +70,7 @@ class Tracker:
         self.settings = settings or TrackerSettings()
         self._seed = checked_whole("seed", seed, least=0)
         self._timeline = Timeline(pose_filter, self.settings, self._seed)
-        self._guard = ClockGuard(self.settings.history_ns, self.settings.clock_samples)
+        self._guard = ClockGuard(*_guarded(self.settings))
         self._counts: Counter[str] = Counter()
         self._is_increments: bool | None = None
 
@@ -257,7 +257,7 @@ class Tracker:
         settings = settings_from_tree(tree["settings"])
         tracker = cls(pose_filter, settings, tree["seed"])
         tracker._timeline.resume(tree)
-        tracker._guard = ClockGuard.from_tree(tree["guard"], settings.history_ns, settings.clock_samples)
+        tracker._guard = ClockGuard.from_tree(tree["guard"], *_guarded(settings))
         tracker._counts = Counter(tree["counts"])
         tracker._is_increments = tree["is_increments"]
         return tracker
@@ -326,3 +326,8 @@ class Tracker:
         measured = tuple(one for step in steps for one in step.measured)
         refused = [stamp for step in steps for stamp in step.refused]
         return Arrival(stamp_ns, outcome, measured, replayed, (*lost, *refused))
+
+
+def _guarded(settings: TrackerSettings) -> tuple[int, int, int]:
+    """The window, the run and the step of a `ClockGuard`; slow odometry is no clock that jumps."""
+    return settings.history_ns, settings.clock_samples, round(1e9 * settings.limits.clock_jump_s)

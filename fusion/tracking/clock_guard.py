@@ -32,10 +32,13 @@ class ClockGuard:
         Length of the window.
     samples : int
         Length of a run ahead that is believed.
+    step_ns : int
+        Samples ahead that are further apart than this, and than the window, are not of one run.
     """
 
-    def __init__(self, history_ns: int, samples: int) -> None:
+    def __init__(self, history_ns: int, samples: int, step_ns: int = 0) -> None:
         self._history_ns, self._samples = history_ns, samples
+        self._steps_ns = {Side.AHEAD: max(history_ns, step_ns), Side.BEHIND: history_ns}
         self._side: Side | None = None
         self._run: list[OdometrySample] = []
 
@@ -56,7 +59,7 @@ class ClockGuard:
         if side is self._side and any(sample.stamp_ns == other.stamp_ns for other in self._run):
             return 0
         newest_ns = max((other.stamp_ns for other in self._run), default=sample.stamp_ns)
-        if side is not self._side or abs(sample.stamp_ns - newest_ns) > self._history_ns:
+        if side is not self._side or abs(sample.stamp_ns - newest_ns) > self._steps_ns[side]:
             given_up = self.clear()
         self._side = side
         self._run.append(sample)
@@ -81,9 +84,9 @@ class ClockGuard:
         return {"side": side, "run": [sample_tree(sample) for sample in self._run]}
 
     @classmethod
-    def from_tree(cls, tree: Any, history_ns: int, samples: int) -> Self:
+    def from_tree(cls, tree: Any, history_ns: int, samples: int, step_ns: int = 0) -> Self:
         """The guard that was written."""
-        guard = cls(history_ns, samples)
+        guard = cls(history_ns, samples, step_ns)
         guard._side = None if tree["side"] is None else Side(tree["side"])
         guard._run = [OdometrySample(**entry) for entry in tree["run"]]
         return guard

@@ -13,6 +13,7 @@ from fusion.odometry import OdometryIncrement, OdometryNoise, accumulate
 from fusion.odometry_limits import MotionKind, OdometryLimits, part_of
 from fusion.tracking.archive import Tree
 
+_LONGEST_AHEAD_S = 300.0  # afterwards it is known no less
 BEGINNING = -(2**63)
 """Before every stamp."""
 
@@ -145,22 +146,23 @@ class OdometryBuffer:
         return accumulate(pieces)
 
     def extrapolated(self, stamp_ns: int) -> OdometryIncrement:
-        """The motion from the newest sample to a later stamp: the mean velocity of the last `gap_s` goes on.
+        """The motion from the newest sample to a later stamp: the mean velocity of the last `gap_s`, or gap, goes on.
 
-        It turns for `gap_s` at most and goes on for `clock_jump_s` at most, and not at all after a gap or a reset.
+        It turns for `gap_s` at most and goes on for `clock_jump_s` at most. After anything else nothing is known of the
+        velocity, and the vehicle may be anywhere within its reach.
         """
         newest_ns, gap_ns = self._stamps[-1], round(1e9 * self._limits.gap_s)
-        start_ns = max(self._stamps[0], newest_ns - gap_ns)
         ahead_ns = stamp_ns - newest_ns
-        delta = np.zeros(3)
-        inside = range(bisect_right(self._stamps, start_ns), len(self))
-        if inside and all(self._kinds[index] is MotionKind.DRIVEN for index in inside):
-            velocity = se2.log(self.motion(start_ns, newest_ns).delta) / (newest_ns - start_ns)
-            straight_ns = max(0, min(ahead_ns, round(1e9 * self._limits.clock_jump_s)) - gap_ns)
-            turned = se2.exp(velocity * min(ahead_ns, gap_ns))
-            delta = se2.compose(turned, np.array([*(straight_ns * velocity[:2]), 0.0]))
-        seconds = 1e-9 * ahead_ns
-        covariance = self._noise.covariance(delta, seconds) + self._limits.beyond_covariance(seconds)
+        seconds = min(1e-9 * ahead_ns, _LONGEST_AHEAD_S)
+        start_ns = self._steady_since(newest_ns - gap_ns)
+        if start_ns is None:
+            return OdometryIncrement(stamp_ns, np.zeros(3), self._limits.reset_covariance(seconds))
+        velocity = se2.log(self.motion(start_ns, newest_ns).delta) / (newest_ns - start_ns)
+        straight_ns = max(0, min(ahead_ns, round(1e9 * self._limits.clock_jump_s)) - gap_ns)
+        turned = se2.exp(velocity * min(ahead_ns, gap_ns))
+        delta = se2.compose(turned, np.array([*(straight_ns * velocity[:2]), 0.0]))
+        over_s = 1e-9 * (newest_ns - start_ns) if self._kinds[-1] is MotionKind.GAP else 0.0
+        covariance = self._noise.covariance(delta, seconds) + self._limits.beyond_covariance(seconds, over_s)
         return OdometryIncrement(stamp_ns, delta, covariance)
 
     def forget_before(self, stamp_ns: int) -> None:
@@ -195,6 +197,18 @@ class OdometryBuffer:
             buffer.insert(OdometrySample(**sample))
         buffer.kind_counts = Counter(tree["kind_counts"])
         return buffer
+
+    def _steady_since(self, earliest_ns: int) -> int | None:
+        """Since when, but for `earliest_ns`, the velocity is that of the newest motion; None where it is not known."""
+        last = len(self) - 1
+        if last < 1 or self._kinds[last] not in (MotionKind.DRIVEN, MotionKind.GAP):
+            return None
+        if self._kinds[last] is MotionKind.GAP:
+            return self._stamps[last - 1]
+        first = last
+        while first > 1 and self._kinds[first - 1] is MotionKind.DRIVEN and self._stamps[first - 1] > earliest_ns:
+            first -= 1
+        return max(self._stamps[first - 1], earliest_ns)
 
     def _motion_into(self, index: int) -> tuple[FloatArray, MotionKind]:
         before = self._samples[index - 1] if index else self._entry

@@ -213,7 +213,7 @@ class Timeline:
         if likelihood is not None:
             measured, memory = self._weigh(stamp_ns, likelihood, distance, memory)
             progress.measured.append(measured)
-            distance = 0.0
+            distance = 0.0 if measured.update.used else distance
         return Node(stamp_ns, self.filter.state(), distance, memory)
 
     def _weigh(
