@@ -49,7 +49,10 @@ def checked(name: str, value: ArrayLike, shape: Shape) -> FloatArray:
         When `value` is not numeric, has another shape, or holds NaN or an infinity.
     """
     try:
-        array = np.asarray(value, dtype=np.float64)
+        given = np.asarray(value)
+        if given.dtype.kind not in "biufO":
+            raise TypeError(given.dtype)
+        array = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise SkyfixError(f"{name}: expected {_shape_text(shape)} numbers, got {type(value).__name__}") from error
     if not _shape_matches(array.shape, shape):

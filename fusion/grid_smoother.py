@@ -193,7 +193,6 @@ def _backward(
 
 
 def _normalised(mass: Float32Array, message: Float32Array) -> Float32Array:
-    product = mass * message
-    product *= np.float32(_WHOLE / product.sum(dtype=np.float64))
-    product *= np.float32(1.0 / _WHOLE)
-    return read_only(product)
+    product = mass * message.astype(np.float64)
+    product /= product.sum()
+    return read_only(product.astype(np.float32))

@@ -29,6 +29,8 @@ from fusion.arrays import FloatArray, keep_plain
 from fusion.errors import SkyfixError
 from fusion.trajectory import Trajectory
 
+FROZEN_M_PER_S = 1e-3
+"""Slower than this, an odometry repeats its position."""
 _SLACK_M = 0.5  # of a possible motion: position noise and stamps that jitter, whatever the time between two samples
 _SLACK_RAD = 0.1
 _OWN_STEPS, _OWN_SPEEDS, _LEAST_SPEED = 5.0, 3.0, 5.0
@@ -90,14 +92,23 @@ class OdometryLimits:
         if self.clock_jump_s < self.gap_s:
             raise SkyfixError(f"odometry limits clock_jump_s: expected >= gap_s {self.gap_s}, got {self.clock_jump_s}")
 
-    def kind(self, delta: FloatArray, seconds: float) -> MotionKind:
-        """Kind of the motion `delta` (3,) between samples `seconds` apart."""
-        reach_m, reach_rad = self._reach(seconds)
+    def kind(self, delta: FloatArray, seconds: float, held_s: float = 0.0) -> MotionKind:
+        """Kind of the motion `delta` (3,) between samples `seconds` apart.
+
+        The first may have held its pose for `held_s` before; then the vehicle may have been on its way for so long.
+        """
+        reach_m, reach_rad = self._reach(seconds + held_s)
         if np.hypot(delta[0], delta[1]) > reach_m or abs(delta[2]) > reach_rad:
             return MotionKind.RESET
         if seconds > self.clock_jump_s:
             return MotionKind.CLOCK_JUMP
         return MotionKind.GAP if seconds > self.gap_s else MotionKind.DRIVEN
+
+    def possible(self, velocity: FloatArray) -> FloatArray:
+        """A velocity (3,), metres and radians a second, in the same direction but no faster than the vehicle is."""
+        speed = max(float(np.hypot(velocity[0], velocity[1])), self.max_speed_m_per_s)
+        turn = max(abs(float(velocity[2])), self.max_turn_rad_per_s)
+        return velocity * [*2 * [self.max_speed_m_per_s / speed], self.max_turn_rad_per_s / turn]
 
     def gap_covariance(self, seconds: float) -> FloatArray:
         """Covariance (3, 3) that a gap adds to that of the motion."""
@@ -127,16 +138,23 @@ class OdometryLimits:
     def fitted(self, odometry: Trajectory) -> Self:
         """The limits for a whole recorded odometry: its own steps and speeds say what is usual.
 
-        Gaps are five of its usual steps at least; three times its highest speed, but for a few steps, is too fast; and
-        since it is of one recording, no time in it is a jump of the clock.
+        Gaps are five of its usual steps at least; three times its highest speed is too fast, where a few fast steps are
+        left out unless they follow one another in one direction; and since it is of one recording, no time in it is a
+        jump of the clock.
         """
         if len(odometry) < 2:
             return self
         seconds = 1e-9 * np.diff(odometry.stamp_ns)
-        gap_s = max(self.gap_s, _OWN_STEPS * float(np.median(seconds)))
-        speeds = np.sort(np.linalg.norm(np.diff(odometry.poses[:, :2], axis=0), axis=1) / seconds)
+        usual_s = float(np.median(seconds))
+        gap_s = max(self.gap_s, _OWN_STEPS * usual_s)
+        seconds_each = np.maximum(seconds, 0.5 * usual_s)  # stamps jitter
+        xy = odometry.poses[:, :2]
+        speeds = np.linalg.norm(np.diff(xy, axis=0), axis=1) / seconds_each
+        in_pairs = np.linalg.norm(xy[2:] - xy[:-2], axis=1) / (seconds_each[1:] + seconds_each[:-1])
+        kept_up = float(np.minimum(in_pairs, np.minimum(speeds[1:], speeds[:-1])).max(initial=0.0))
         jumps = max(_FAST_COUNT, int(_FAST_SHARE * len(speeds)))
-        own = max(_OWN_SPEEDS * float(speeds[-1 - jumps]), _LEAST_SPEED) if len(speeds) > 2 * jumps else np.inf
+        usual = float(np.sort(speeds)[-1 - jumps]) if len(speeds) > 2 * jumps else np.inf
+        own = max(_OWN_SPEEDS * max(usual, kept_up), _LEAST_SPEED)
         return replace(
             self,
             gap_s=gap_s,

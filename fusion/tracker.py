@@ -45,7 +45,7 @@ from fusion.tracking.tracker_input import (
 from fusion.tracking.tracker_report import Arrival, Outcome, Statistics
 from fusion.tracking.tracker_settings import TrackerSettings, settings_from_tree
 
-_FORMAT, _VERSION = "skyfix tracker", 2
+_FORMAT, _VERSION = "skyfix tracker", 3
 
 
 class Tracker:
@@ -190,8 +190,9 @@ class Tracker:
         Raises
         ------
         SkyfixError
-            When there is no odometry yet, or the time is before the history.
+            When there is no odometry yet, the time is before the history, or `max_modes` is no whole number >= 0.
         """
+        max_modes = checked_whole("max_modes", max_modes, least=0)
         newest_ns = self._timeline.newest_ns
         if newest_ns is None:
             raise SkyfixError("estimate: expected odometry before it, got none")
@@ -279,7 +280,8 @@ class Tracker:
 
     def _placed(self, sample: OdometrySample) -> Arrival:
         newest_ns = self._timeline.newest_ns
-        if newest_ns is not None and sample.stamp_ns > newest_ns + self.settings.history_ns:
+        step_ns = 0 if newest_ns is None else sample.stamp_ns - newest_ns
+        if step_ns > self._guard.ahead_ns:
             return self._take_outside(sample, Side.AHEAD)
         if sample.stamp_ns <= self._timeline.horizon_ns:
             return self._take_outside(sample, Side.BEHIND)
@@ -288,7 +290,7 @@ class Tracker:
             arrival = self._repeated(sample.stamp_ns, existing.same_as(sample))
         else:
             arrival = self._use_odometry([sample], [])
-        self._counts["dismissed_odometry"] += self._guard.clear()
+        self._counts["dismissed_odometry"] += self._guard.in_time(step_ns)
         return arrival
 
     def _take_outside(self, sample: OdometrySample, side: Side) -> Arrival:

@@ -19,6 +19,7 @@ from fusion import (
     se2,
     smooth_on_grid,
 )
+from fusion.grid_smoother import _normalised
 from fusion.grids.grid_motion import GridMotion
 from fusion.grids.pose_lattice import PoseLattice
 from fusion.grids.scratch import Scratch
@@ -132,6 +133,15 @@ def test_paths_are_drawn_as_often_as_they_are_probable():
         assert 0.5 * np.abs(found - expected).sum() < 1.5 * 0.4 * noise.sum()  # mean |N(0, 1)| / 2 = 0.4
     again = smooth_on_grid(start, 10, increments, likelihoods).sample_paths(count, 4)
     np.testing.assert_array_equal(paths, again)
+
+
+def test_a_marginal_whose_filter_and_future_hardly_agree_is_that_of_their_product():
+    """Where one knows best the other's mass is far below the smallest single-precision number."""
+    mass, message = (np.exp(-0.5 * (np.arange(40.0) - at) ** 2).astype(np.float32) for at in (13.0, 26.0))
+    found = _normalised(mass, message)
+    exact = mass.astype(float) * message.astype(float)
+    np.testing.assert_allclose(found, exact / exact.sum(), rtol=1e-6, atol=1e-30)
+    assert found.sum() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_the_last_marginal_is_the_filter_s_and_earlier_ones_know_more():

@@ -123,6 +123,26 @@ def test_a_pose_that_is_repeated_where_a_vehicle_at_speed_cannot_have_stopped_is
         assert (spread_m < 4.0) if catches_up else (spread_m > 16.0)  # of the 33 m that it drove
 
 
+def test_a_gap_across_which_it_went_further_than_its_speeds_may_be_a_new_start():
+    apart = without(jumping(straight_on(300), 140, [60.0, 0.0, 0.0]), 101, 140)
+    _, doubts = believed_odometry(apart, LIMITS)
+    assert doubts.kinds == (MotionKind.GAP,)
+    half_m = 0.5 * (0.8 * 39 + 60.0 - 8.0 * 4.0)
+    assert doubts.covariances[0, 0, 0] - LIMITS.gap_covariance(4.0)[0, 0] == pytest.approx(half_m**2)
+
+
+def test_a_jump_that_makes_up_for_a_frozen_pose_is_a_gap_even_where_the_vehicle_is_slow():
+    slow = along(np.full(600, 1.2), 10.0)
+    poses = slow.poses.copy()
+    poses[101:241] = poses[100]  # 14 s, then 16.9 m at once
+    motion, doubts = believed_odometry(Trajectory(slow.stamp_ns, poses, None, "odometry"), LIMITS)
+    assert doubts.kinds == (MotionKind.GAP,)
+    np.testing.assert_allclose(motion.interpolate(slow.stamp_ns), slow.poses, atol=1e-9)
+    poses[241:] += [30.0, 0.0, 0.0]  # but this is not where it would be
+    motion, doubts = believed_odometry(Trajectory(slow.stamp_ns, poses, None, "odometry"), LIMITS)
+    assert doubts.kinds == (MotionKind.RESET,)
+
+
 def along(speeds: np.ndarray, hertz: float, step_m: float = 0.0) -> Trajectory:
     """Straight on at speeds, told in steps of a length."""
     way = np.cumsum(speeds / hertz)
@@ -155,6 +175,25 @@ def test_an_odometry_that_is_only_coarse_slow_or_halting_is_believed(name):
     assert np.abs(moved).max() <= (10.0 if "ten times" in name else 0.0)  # which is interpolated between its poses
 
 
+@pytest.mark.parametrize(("published", "computed", "speed"), [(50, 10, 8.0), (50, 10, 15.0), (200, 20, 25.0)])
+def test_an_odometry_that_is_published_more_often_than_computed_goes_on_between_its_poses(published, computed, speed):
+    smooth = along(np.full(20 * published, speed), published)
+    held = Trajectory(smooth.stamp_ns, smooth.poses[np.arange(len(smooth)) // computed * computed], None, "odometry")
+    motion, doubts = believed_odometry(held, LIMITS)
+    assert str(doubts) == "nothing doubtful"
+    off_m = np.abs(motion.interpolate(smooth.stamp_ns)[:, 0] - smooth.poses[:, 0])[: -2 * computed]
+    assert off_m.max() <= speed * computed / published
+
+
+@pytest.mark.parametrize("speed", [2.0, 8.0, 15.0])
+def test_a_slow_odometry_that_is_published_often_goes_on_between_its_poses(speed):
+    smooth = along(np.full(600, speed), 10.0)
+    held = Trajectory(smooth.stamp_ns, smooth.poses[np.arange(600) // 10 * 10], None, "odometry")  # one a second
+    motion, doubts = believed_odometry(held, LIMITS)
+    assert str(doubts) == "nothing doubtful"
+    assert np.abs(motion.interpolate(smooth.stamp_ns)[:, 0] - smooth.poses[:, 0]).max() <= speed
+
+
 @given(st.floats(0.0, 0.3), st.integers(0, 2**32 - 1))
 def test_noise_at_a_standstill_is_no_jump(sigma_m, seed):
     speeds = np.repeat([0.0, 8.0, 0.0], [800, 100, 100])
@@ -170,8 +209,10 @@ def test_a_vehicle_that_brakes_and_stands_is_believed():
     assert motion is stopping
     assert len(doubts) == 0
     poses = stopping.poses.copy()
-    poses[40:44] = poses[40]  # three tenths of a second: messages were dropped
-    assert len(believed_odometry(Trajectory(stopping.stamp_ns, poses, None, "odometry"), LIMITS)[0]) == 230
+    poses[40:44] = poses[40]  # three tenths of a second: it goes on between its poses, which looks like no jump
+    motion, doubts = believed_odometry(Trajectory(stopping.stamp_ns, poses, None, "odometry"), LIMITS)
+    assert len(doubts) == 0
+    np.testing.assert_allclose(motion.interpolate(stopping.stamp_ns), stopping.poses, atol=1e-9)
 
 
 @pytest.mark.parametrize("inside", [slice(200, 300), slice(0, 100)])
@@ -217,6 +258,14 @@ def test_limits_are_fitted_to_a_recordings_own_rate_and_speed():
     for at in (50, 90, 130):
         wild = jumping(wild, at, [300.0, 0.0, 0.0])
     assert LIMITS.fitted(wild).max_speed_m_per_s == pytest.approx(24.0, rel=1e-6)
+    jittered = winding(200)
+    late = jittered.stamp_ns.copy()
+    late[5:150:10] += TENTH - TENTH // 100  # fifteen stamps a hundredth of a step before the next
+    assert LIMITS.fitted(Trajectory(late, jittered.poses)).max_speed_m_per_s == pytest.approx(48.0)
+    way = np.cumsum(np.where((np.arange(200) >= 100) & (np.arange(200) < 104), 3.0, 0.2))  # a dash of four steps
+    dashing = Trajectory(np.arange(200) * TENTH, way[:, None] * [1.0, 0.0, 0.0], None, "odometry")
+    assert LIMITS.fitted(dashing).max_speed_m_per_s == 60.0
+    assert len(believed_odometry(dashing, LIMITS)[1]) == 0
     assert LIMITS.fitted(winding(8)).max_speed_m_per_s == 60.0  # too few to say
     assert LIMITS.fitted(winding(1)) is LIMITS
     assert replace(LIMITS, gap_s=2.0).fitted(winding(200)).gap_s == 2.0

@@ -208,6 +208,8 @@ NONSENSE = [
     (lambda t: t.add_likelihood(at(1.5), Strange(ValueError("two\nlines"))), "expected log densities, got ValueError"),
     (lambda t: t.estimate(at(-10.0)), "estimate: expected a stamp from"),
     (lambda t: t.estimate(1.0), "stamp: expected int64 nanoseconds, got float 1.0"),
+    (lambda t: t.estimate(max_modes=1.5), "max_modes: expected a whole number >= 0, got 1.5"),
+    (lambda t: t.estimate(max_modes=-1), "max_modes: expected a whole number >= 0, got -1"),
 ]
 
 

@@ -181,9 +181,9 @@ def test_a_bad_file_is_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda tree: {**tree, "version": 99}, "expected a saved tracker of version 2"),
-        (lambda tree: {**tree, "format": "else"}, "expected a saved tracker of version 2"),
-        (lambda tree: ["a list"], "expected a saved tracker of version 2"),
+        (lambda tree: {**tree, "version": 99}, "expected a saved tracker of version 3"),
+        (lambda tree: {**tree, "format": "else"}, "expected a saved tracker of version 3"),
+        (lambda tree: ["a list"], "expected a saved tracker of version 3"),
         (lambda tree: {k: v for k, v in tree.items() if k != "history"}, "with parts missing or damaged"),
         (lambda tree: {**tree, "history": []}, "with parts missing or damaged"),
         (lambda tree: {**tree, "settings": {**tree["settings"], "colour": 1}}, "with parts missing or damaged"),

@@ -71,6 +71,9 @@ def test_length_is_that_of_the_path():
         ([0, 1], np.full((2, 3), np.nan), None, "finite"),
         ([0, 1], np.zeros((2, 3)), np.zeros((2, 2, 2)), "covariances"),
         ([0.0, 0.1], np.zeros((2, 3)), None, "int64"),
+        ([0, 1], [["0", "1", "2"]] * 2, None, "numbers, got list"),
+        ([0, 1], np.zeros((2, 3), dtype="datetime64[ns]"), None, "numbers, got ndarray"),
+        ([0, 1], np.zeros((2, 3), dtype=complex), None, "numbers, got ndarray"),
     ],
 )
 def test_bad_trajectories_are_refused_in_one_line(stamps, poses, covariances, word):

@@ -4,12 +4,14 @@ A stamp far ahead would push everything else out of the window, and a clock that
 too late for ever. So samples outside the window are looked at together: a run of them, each within a window's length
 of the newest in the run and none from inside the window among them, says that this is the clock now.
 
-- Ahead: believed after a number of samples, which are then used. They are withheld until then.
+- Ahead: believed after a number of samples, which are then used. They are withheld until then. Where the run's own
+  samples are further apart than the window, the odometry is slow: as long as that lasts its next sample is no stray.
 - Behind: each is too late as it comes. Believed when the run is longer than the window and half as dense as the
   odometry in it, which messages that are merely late are not; then the run is used.
 """
 
 from enum import Enum
+from itertools import pairwise
 from typing import Any, Self
 
 from fusion.tracking.archive import Tree
@@ -21,6 +23,9 @@ class Side(Enum):
 
     AHEAD = "ahead"
     BEHIND = "behind"
+
+
+_SLOW_STEPS = 1.5
 
 
 class ClockGuard:
@@ -39,6 +44,8 @@ class ClockGuard:
     def __init__(self, history_ns: int, samples: int, step_ns: int = 0) -> None:
         self._history_ns, self._samples = history_ns, samples
         self._steps_ns = {Side.AHEAD: max(history_ns, step_ns), Side.BEHIND: history_ns}
+        self.ahead_ns = history_ns
+        """A sample further ahead of the newest than this is outside the window."""
         self._side: Side | None = None
         self._run: list[OdometrySample] = []
 
@@ -46,6 +53,12 @@ class ClockGuard:
     def withheld(self) -> int:
         """Number of samples ahead that wait for more."""
         return len(self._run) if self._side is Side.AHEAD else 0
+
+    def in_time(self, step_ns: int) -> int:
+        """Take note of a sample from inside the window, so long after the newest; ends the run as `clear` does."""
+        if 0 < step_ns <= self._history_ns:
+            self.ahead_ns = self._history_ns
+        return self.clear()
 
     def clear(self) -> int:
         """End the run and say how many samples were withheld."""
@@ -75,18 +88,21 @@ class ClockGuard:
             is_long = is_dense and max(stamps) - min(stamps) > self._history_ns
         run = sorted(self._run, key=lambda sample: sample.stamp_ns) if is_long else []
         if is_long:
+            widest_ns = max((later.stamp_ns - one.stamp_ns for one, later in pairwise(run)), default=0)
+            self.ahead_ns = round(_SLOW_STEPS * widest_ns) if widest_ns > self._history_ns else self._history_ns
             self.clear()
         return run
 
     def to_tree(self) -> Tree:
         """Everything, for a file."""
         side = None if self._side is None else self._side.value
-        return {"side": side, "run": [sample_tree(sample) for sample in self._run]}
+        return {"side": side, "run": [sample_tree(sample) for sample in self._run], "ahead_ns": self.ahead_ns}
 
     @classmethod
     def from_tree(cls, tree: Any, history_ns: int, samples: int, step_ns: int = 0) -> Self:
         """The guard that was written."""
         guard = cls(history_ns, samples, step_ns)
         guard._side = None if tree["side"] is None else Side(tree["side"])
+        guard.ahead_ns = tree["ahead_ns"]
         guard._run = [OdometrySample(**entry) for entry in tree["run"]]
         return guard

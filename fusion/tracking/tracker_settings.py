@@ -29,7 +29,8 @@ class TrackerSettings:
     max_waiting : int
         Likelihoods that odometry does not cover yet are kept up to this many, the last to arrive.
     clock_samples : int
-        Odometry ahead of everything else by more than `history_s` is believed after so many samples in a row.
+        Odometry ahead of everything else by more than `history_s` is believed after so many samples in a row; of slow
+        odometry every sample from then on.
     noise : OdometryNoise
         Of odometry that comes as poses.
     limits : OdometryLimits
