@@ -82,6 +82,17 @@ class MapMatcher(Protocol):
         ...
 
 
+def match_scan(
+    matcher: MapMatcher, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
+) -> LikelihoodVolume:
+    """A matcher's answer, see `MapMatcher.match`; SkyfixError if one of the user's own answers with anything else."""
+    answer: object = matcher.match(points, ground_z, map_raster, search)
+    if not isinstance(answer, LikelihoodVolume):
+        kind = type(answer).__name__
+        raise SkyfixError(f"matcher {matcher.name}: expected match() to answer with a LikelihoodVolume, got {kind}")
+    return answer
+
+
 @runtime_checkable
 class BoundedMatcher(Protocol):
     """A `MapMatcher` that refuses searches of more than some extent: one whose network sees a crop of one size."""
@@ -140,7 +151,8 @@ def load_matcher(name_or_path: str, backend: str | None = None) -> MapMatcher:
     Parameters
     ----------
     name_or_path
-        A name, a .safetensors file, or a folder that `learned.export.export` wrote.
+        A name, a .safetensors file, a folder that `learned.export.export` wrote, or a matcher of one's own as
+        `learned.own_matcher` names it: 'mine.py:MyNetwork'.
     backend
         What runs the encoders: 'torch' or a name of `learned.backends.BACKENDS`. None: torch; for a folder, the first
         runtime that is installed.
@@ -148,11 +160,12 @@ def load_matcher(name_or_path: str, backend: str | None = None) -> MapMatcher:
     Raises
     ------
     SkyfixError
-        If a name is unknown, the file is missing, the checkpoint does not match this version's network, or the
-        backend is not installed or cannot run the matcher.
+        If a name is unknown, the file is missing, the checkpoint does not match this version's network, the
+        backend is not installed or cannot run the matcher, or one's own cannot be imported.
     """
     from learned.backends import backend_named
     from learned.exported import load_exported, with_backend
+    from learned.own_matcher import load_own_matcher, own_matcher_named
 
     runtime = None if backend in (None, "torch") else backend_named(str(backend))
     path = Path(name_or_path)
@@ -160,7 +173,8 @@ def load_matcher(name_or_path: str, backend: str | None = None) -> MapMatcher:
         if backend == "torch":
             raise SkyfixError(f"backend: expected openvino or onnxruntime for the export {path}, got torch")
         return load_exported(path, runtime)
-    matcher = _torch_matcher(name_or_path)
+    own = own_matcher_named(name_or_path)
+    matcher = _torch_matcher(name_or_path) if own is None else load_own_matcher(own)
     return matcher if runtime is None else with_backend(matcher, runtime)
 
 
@@ -179,5 +193,5 @@ def _torch_matcher(name_or_path: str) -> MapMatcher:
     path = Path(name_or_path)
     if path.suffix == ".safetensors":
         return load_checkpoint(path)
-    expected = "'rotmatch', 'pooled', 'geometric', a .safetensors file or a folder of `skyfix export`"
+    expected = "'rotmatch', 'pooled', 'geometric', FILE.py:NAME, a .safetensors file or a folder of `skyfix export`"
     raise SkyfixError(f"matcher: expected {expected}, got {name_or_path!r}")

@@ -20,7 +20,7 @@ from fusion.errors import SkyfixError
 from fusion.likelihood import LikelihoodVolume
 from learned.checkpoint import load_checkpoint
 from learned.map_raster import MapRaster
-from learned.matcher import MapMatcher, SearchRegion, error_correlation_length_m, largest_half_extent_m
+from learned.matcher import MapMatcher, SearchRegion, error_correlation_length_m, largest_half_extent_m, match_scan
 from learned.rotmatch import RotMatch
 from learned.whole_map import WholeMapMatcher, WholeMapSearch
 
@@ -82,7 +82,7 @@ class PooledMatcher:
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
     ) -> LikelihoodVolume:
         """The pool of all answers; see `learned.matcher.MapMatcher.match`."""
-        volumes = [matcher.match(points, ground_z, map_raster, search) for matcher in self.matchers]
+        volumes = [match_scan(matcher, points, ground_z, map_raster, search) for matcher in self.matchers]
         first = volumes[0]
         valid = first.log_prob > first.floor
         scores = np.zeros(first.log_prob.shape)

@@ -43,6 +43,7 @@ app.command(
     "`skyfix track drives/kitti_13 --odometry lidar_gicp`\n\n"
     "`skyfix track drives/mine --start 12.5 -80 90 --half-extent 30 --heading-unknown --out runs/mine`\n\n"
     "`skyfix track drives/mine --start-anywhere`\n\n"
+    "`skyfix track drives/mine --matcher my_network.py:MyNetwork`\n\n"
     "`skyfix track drives/mine --set filter.adaptive.most=50000 --set noise.lateral_m_per_sqrt_m=0.02`"
 )(track)
 app.command(epilog="Example: `skyfix view runs/demo-emulated-seed0`")(view)

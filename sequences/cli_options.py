@@ -15,7 +15,8 @@ MatcherOption = Annotated[
     str,
     typer.Option(
         help="Matches scans with the map: rotmatch (learned, shipped), pooled (another network beside it: twice the "
-        "time, fewer mistakes), geometric (no learning), a .safetensors file or a folder of `skyfix export`.",
+        "time, fewer mistakes), geometric (no learning), a .safetensors file, a folder of `skyfix export`, or one of "
+        "your own: FILE.py:NAME, MODULE:NAME.",
         metavar="NAME|FILE",
     ),
 ]

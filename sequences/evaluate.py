@@ -22,7 +22,7 @@ from fusion.likelihood import LikelihoodVolume
 from fusion.trajectory import Trajectory
 from learned.calibration import Calibration, sample_map
 from learned.map_raster import MapRaster
-from learned.matcher import MapMatcher, SearchRegion
+from learned.matcher import MapMatcher, SearchRegion, match_scan
 from learned.network import NetworkMatcher
 from learned.samples import Sample
 from sequences.drive import STAMP_TOLERANCE_NS
@@ -173,7 +173,7 @@ def evaluate_samples(
 def _ask_matcher(
     points: Float32Array, ground_z: float, raster: MapRaster, search: SearchRegion, matcher: MapMatcher
 ) -> LikelihoodVolume:
-    return matcher.match(points, ground_z, raster, search)
+    return match_scan(matcher, points, ground_z, raster, search)
 
 
 def _ask_network(

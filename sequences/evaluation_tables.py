@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from learned.own_matcher import own_matcher_named
+
 PRIOR = "prior"
 _HEADER = (
     *("sequence", "start", "method", "frames", "mean m", "median m", "heading mean °", "heading median °"),
@@ -65,6 +67,9 @@ def matcher_labels(names: Sequence[str]) -> dict[str, str]:
 
 
 def _label(name: str, folders: int) -> str:
+    own = own_matcher_named(name)
+    if own is not None:
+        return own.label if folders == 0 else name
     path = Path(name).with_suffix("")
     return "/".join(path.parts[-1 - folders :]) if name.endswith(".safetensors") else name
 

@@ -17,7 +17,7 @@ from fusion.odometry import OdometryIncrement, accumulate
 from fusion.particle_filter import ParticleFilter
 from fusion.prior import UniformPrior
 from fusion.two_level import TwoLevelLikelihood
-from learned.matcher import MapMatcher, error_correlation_length_m, largest_half_extent_m
+from learned.matcher import MapMatcher, error_correlation_length_m, largest_half_extent_m, match_scan
 from sequences.anywhere import Predicted
 from sequences.anywhere_search import AnywhereSearch
 from sequences.drive import Drive
@@ -203,7 +203,7 @@ class FilterPass:
             return Measurement(points, self._anywhere.region(), everywhere, self._temperature())
         search = self._plan.region(prediction)
         with watch("match"):
-            likelihood = self._matcher.match(points, sequence.ground_z, sequence.map, search)
+            likelihood = match_scan(self._matcher, points, sequence.ground_z, sequence.map, search)
         return Measurement(points, search, likelihood, self._temperature())
 
     def _temperature(self) -> float:

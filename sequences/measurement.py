@@ -8,7 +8,6 @@ import numpy as np
 
 from fusion import se2
 from fusion.arrays import Float32Array, FloatArray
-from fusion.errors import SkyfixError
 from fusion.estimate import Estimate
 from fusion.graph.patch import LikelihoodPatch, Neighbourhood, patch_of
 from fusion.likelihood import LikelihoodVolume
@@ -33,23 +32,12 @@ class Measurement:
         As the matcher gave it: a volume about a prediction, or two levels over a whole map.
     temperature
         By which the filter and the smoother flatten it, for errors shared with the measurement before.
-
-    Raises
-    ------
-    SkyfixError
-        When a matcher of the user's own has answered with anything else.
     """
 
     points: Float32Array
     search: SearchRegion
     likelihood: LikelihoodVolume | TwoLevelLikelihood
     temperature: float
-
-    def __post_init__(self) -> None:
-        answer: object = self.likelihood
-        if not isinstance(answer, (LikelihoodVolume, TwoLevelLikelihood)):
-            kind = type(answer).__name__
-            raise SkyfixError(f"matcher: expected match() to answer with a LikelihoodVolume, got {kind}")
 
     def patch(self, estimate: Estimate) -> LikelihoodPatch:
         """The likelihood around the filter's estimate, flattened by the temperature, for the smoother."""

@@ -19,6 +19,7 @@ from rich.console import Console
 
 from fusion.errors import SkyfixError
 from learned.matcher import MapMatcher, load_matcher
+from learned.own_matcher import own_matcher_named
 from learned.training import make_folder
 from sequences.dotted_keys import dotted
 from sequences.localize import track
@@ -95,7 +96,9 @@ def _is_done(run: SweepRun, matcher: MapMatcher) -> bool:
     try:
         there = (run.folder / CONFIG_FILE).read_text(encoding="utf-8")
         made_at = (run.folder / METRICS_FILE).stat().st_mtime
-        weights_at = Path(run.matcher).stat().st_mtime if Path(run.matcher).exists() else made_at
+        own = own_matcher_named(run.matcher)
+        weights = Path(run.matcher if own is None else own.source)
+        weights_at = weights.stat().st_mtime if weights.exists() else made_at
     except OSError as error:
         raise SkyfixError(f"{run.folder}: cannot be read: {error.strerror}") from error
     wanted = config_text(run.name, matcher.name, run.settings)

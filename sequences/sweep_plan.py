@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fusion.errors import SkyfixError
+from learned.own_matcher import own_matcher_named
 from sequences.dotted_keys import as_overrides, changed, split_override
 from sequences.registry import OpenOptions, open_sequence
 from sequences.sequence import Sequence as Drive
@@ -84,7 +85,9 @@ class SweepRun:
 
 def matcher_label(matcher: str) -> str:
     """A matcher's name: of a checkpoint its folder's and its own, for those of one network are called alike."""
-    path = Path(matcher)
+    own, path = own_matcher_named(matcher), Path(matcher)
+    if own is not None:
+        return own.label
     return f"{path.resolve().parent.name}/{path.stem}" if path.suffix else path.name
 
 

@@ -287,7 +287,7 @@ def test_a_matcher_that_answers_with_anything_else_is_told(made_drive: MadeDrive
             super().match(*asked)
 
     with pytest.raises(
-        SkyfixError, match=r"matcher: expected match\(\) to answer with a LikelihoodVolume, got NoneType"
+        SkyfixError, match=r"matcher .*: expected match\(\) to answer with a LikelihoodVolume, got NoneType"
     ):
         track(FolderSequence(made_drive.path), Silent(made_drive.truth.poses), SETTINGS)
 
