@@ -3,7 +3,7 @@
 Symmetric InfoNCE (van den Oord et al., 2018, equation 4; CLIP's form) with temperature 0.07 over the hardest
 negatives, after TransLocNet (arXiv 2512.10419). It must be fed features from before the cross-attention: after it,
 each side has seen the other and the pair gives itself away. Two samples that are less than 20 m apart show the same
-place and are no negatives of each other.
+place and are no negatives of each other. Where several processes share a batch, the negatives are of all of it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from fusion.errors import SkyfixError
+from learned.processes import rows_of_all
 
 
 class Projection(nn.Module):
@@ -44,7 +45,7 @@ def info_nce(
     Parameters
     ----------
     scans, maps
-        (B, D) unit vectors; row i of both is one place.
+        (B, D) unit vectors; row i of both is one place. Of processes that train together each gives its share.
     temperature
         tau, divides the cosines.
     hard_negatives
@@ -65,6 +66,8 @@ def info_nce(
     """
     if scans.ndim != 2 or scans.shape != maps.shape:
         raise SkyfixError(f"embeddings: expected two of (B, D), got {tuple(scans.shape)} and {tuple(maps.shape)}")
+    scans, maps = rows_of_all(scans), rows_of_all(maps)
+    positions_m = None if positions_m is None else rows_of_all(positions_m)
     logits = scans @ maps.T / temperature
     negative = negatives(len(scans), positions_m, same_place_m).to(logits.device)
     both = (_one_way(logits, negative, hard_negatives), _one_way(logits.T, negative, hard_negatives))

@@ -44,8 +44,7 @@ class Batch:
         Of pictures and scans alike.
     first
         Number of the first example within the step's whole batch; above zero only where several processes share it.
-        A network that draws once an example skips that many draws, so that the processes see what one would have;
-        its contrastive loss, though, has the negatives of each process's own share alone.
+        A network that draws once an example skips that many draws, so that the processes see what one would have.
     place
         (B, 2) float64: where the samples were taken, metres in one frame, NaN where that is not known; or None.
     """

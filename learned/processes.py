@@ -74,6 +74,22 @@ class _Objective(nn.Module):
         return self.net.losses(batch, generator)
 
 
+def rows_of_all(rows: Tensor) -> Tensor:
+    """The rows (B, ...) of all processes that train together, in order: (count B, ...); alone, the rows themselves.
+
+    A loss of them is the same in every process, but has a gradient in this one's rows only. That counts `count` times,
+    so that the average over the processes is the gradient of the loss.
+    """
+    if not (dist.is_initialized() and torch.is_grad_enabled()):
+        return rows
+    count = dist.get_world_size()
+    parts = [torch.empty_like(rows) for _ in range(count)]
+    dist.all_gather(parts, rows.detach().contiguous())
+    if rows.requires_grad:
+        parts[dist.get_rank()] = count * rows - (count - 1) * rows.detach()
+    return torch.cat(parts)
+
+
 @contextmanager
 def joined_processes(environment: Mapping[str, str] = os.environ) -> Iterator[Processes]:
     """Join the processes that torchrun has started together (it sets RANK, WORLD_SIZE and where to meet).

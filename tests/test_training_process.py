@@ -54,29 +54,33 @@ def test_a_killed_training_ends_as_if_nothing_had_happened(tmp_path: Path, monke
     assert [row[:3] for row in curves[0]] == [row[:3] for row in curves[1]]
 
 
-def test_two_processes_have_the_loss_curve_of_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("network", TOGETHER)
+def test_two_processes_have_the_loss_curve_of_one(network: str, tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     meeting = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
-    both = [start(tmp_path / "two", "together", RANK=str(rank), **meeting) for rank in range(2)]
-    train(Landmarks(6), Landmarks(1), TOGETHER, tmp_path / "one")
+    both = [start(tmp_path / "two", f"together {network}", RANK=str(rank), **meeting) for rank in range(2)]
+    train(Landmarks(12), Landmarks(1), TOGETHER[network], tmp_path / "one")
     assert [process.wait(timeout=240) for process in both] == [0, 0]
     curves = []
     for name in ("one", "two"):
         with (tmp_path / name / "loss.csv").open() as file:
-            curves.append([(float(row["loss"]), float(row["validation_nll"])) for row in csv.DictReader(file)])
-    assert len(curves[0]) == TOGETHER.steps
+            rows = [dict(row) for row in csv.DictReader(file)]
+        curves.append([[float(value) for key, value in row.items() if key != "seconds"] for row in rows])
+    assert ("contrastive" in rows[0]) == (network == "hybrid")
+    assert len(curves[0]) == TOGETHER[network].steps
     np.testing.assert_allclose(curves[1], curves[0], atol=2e-3)
-    assert np.ptp(np.array(curves[0])[:, 0]) > 0.1  # the steps differ by more than that
+    assert np.ptp(np.array(curves[0])[:, 1]) > 0.1  # the steps differ by more than that
 
 
 def test_processes_share_out_every_batch_and_no_sample_twice() -> None:
     def truths(processes: Processes) -> list[list[float]]:
-        return [batch.yaw.tolist() for batch in training_batches(Landmarks(6), TOGETHER, 1, processes)]
+        settings = TOGETHER["rotmatch"]
+        return [batch.yaw.tolist() for batch in training_batches(Landmarks(12), settings, 1, processes)]
 
     whole = truths(Processes())
     parts = [truths(Processes(rank, 2)) for rank in range(2)]
     assert [a + b for a, b in zip(*parts, strict=True)] == whole
-    with pytest.raises(SkyfixError, match="expected a multiple of the 3 processes, got 2"):
+    with pytest.raises(SkyfixError, match="expected a multiple of the 3 processes, got 4"):
         truths(Processes(0, 3))

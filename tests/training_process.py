@@ -1,7 +1,7 @@
 """A training in a process of its own, for tests that kill it or run several: `python training_process.py OUT WHEN`.
 
 WHEN says when it kills itself with SIGKILL: "never", "before 5" (as step 5 is done) or "writing 2" (the second state is
-written but not in its place yet). Under RANK and WORLD_SIZE it trains together with others.
+written but not in its place yet). With "together hybrid", under RANK and WORLD_SIZE, it trains a network with others.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from guess_network import GUESS, GuessSettings
 from landmarks import Landmarks
 
 from learned.architectures import ARCHITECTURES
+from learned.hybrid import HybridSettings
 from learned.processes import joined_processes
 from learned.rotmatch import RotMatchSettings
 from learned.training import NetworkChoice, TrainingSettings, train
@@ -31,15 +32,22 @@ KILLED = TrainingSettings(
     ema_decay=0.5,
     network=NetworkChoice("guess", GuessSettings(dropout=0.3)),
 )
-TOGETHER = TrainingSettings(
-    steps=3,
-    batch=2,
-    warmup_steps=1,
-    validate_every=1,
-    workers=0,
-    precision="float32",
-    network=NetworkChoice("rotmatch", RotMatchSettings(4, (4, 4, 8, 8))),
-)
+_TINY = {
+    "rotmatch": RotMatchSettings(4, (4, 4, 8, 8)),
+    "hybrid": HybridSettings(4, (4, 4, 8, 8), contrastive_weight=1.0, embedding=4),
+}
+TOGETHER = {
+    name: TrainingSettings(
+        steps=3,
+        batch=4,
+        warmup_steps=1,
+        validate_every=1,
+        workers=0,
+        precision="float32",
+        network=NetworkChoice(name, network),
+    )
+    for name, network in _TINY.items()
+}
 
 
 def kill_self(*_: object) -> None:
@@ -51,7 +59,7 @@ def main(out: Path, when: str) -> None:
     moment, _, number = when.partition(" ")
     if moment == "together":
         with joined_processes() as processes:
-            train(Landmarks(6), Landmarks(1), TOGETHER, out, processes=processes)
+            train(Landmarks(12), Landmarks(1), TOGETHER[number], out, processes=processes)
         return
     if moment == "writing":
         written = iter(range(1, 100))
