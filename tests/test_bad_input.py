@@ -117,7 +117,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "unknown odometry": (["--odometry", "sonar"], "odometry 'sonar': unknown for made_drive; there are: wheels"),
     "unknown matcher": (
         ["--matcher", "tea-leaves"],
-        "matcher: expected 'rotmatch', 'pooled', 'geometric', a .safetensors file or",
+        "matcher: expected 'rotmatch', 'pooled', 'geometric', FILE.py:NAME, a .safetensors file or",
     ),
     "no particles": (["--particles", "0"], "particles: expected more than 0"),
     "heading too wide": (["--half-heading-deg", "270"], "half_heading_deg: expected at most 180"),
