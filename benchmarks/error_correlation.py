@@ -20,6 +20,7 @@ from benchmarks.command import run
 from benchmarks.drawn_drives import DrawnDrive
 from fusion.arrays import FloatArray
 from fusion.error_correlation import estimate_error_correlation
+from learned.answers import match_scan
 from learned.matcher import MapMatcher, SearchRegion, load_matcher
 from sequences.measurement import best_pose
 from sequences.metrics import distance_along, vehicle_frame_errors
@@ -60,7 +61,7 @@ def _errors(matcher: MapMatcher, number: int, every_m: float) -> tuple[FloatArra
     for frame, centre in zip(frames.tolist(), centres, strict=True):
         points, search = drive.scan(frame), SearchRegion(centre, _HALF_EXTENT_M, _HALF_HEADING_RAD)
         for kind, shown in drive.maps.items():
-            found[kind].append(best_pose(matcher.match(points, drive.ground_z, shown, search)))
+            found[kind].append(best_pose(match_scan(matcher, points, drive.ground_z, shown, search)))
     errors = {kind: vehicle_frame_errors(truth, np.array(poses)) for kind, poses in found.items()}
     return along[frames], {kind: np.column_stack(columns) for kind, columns in errors.items()}
 

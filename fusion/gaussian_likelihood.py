@@ -10,7 +10,7 @@ from fusion.arrays import FloatArray, checked, keep_plain
 from fusion.errors import SkyfixError
 from fusion.gaussian_mixture import GaussianMixture
 from fusion.grid import MapGrid
-from fusion.likelihood import DEFAULT_FLOOR, OutlierMixture, checked_temperature
+from fusion.likelihood import DEFAULT_FLOOR, LikelihoodVolume, OutlierMixture, checked_temperature
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +51,13 @@ class GaussianLikelihood:
     def searched_volume(self) -> float:
         """The grid times all headings, m^2 rad."""
         return self.grid.area_m2 * se2.TWO_PI
+
+    def to_volume(self, yaw_bins: int = 180) -> LikelihoodVolume:
+        """The density at the cells of the grid and so many headings, normalised there."""
+        x, y = self.grid.centres()
+        yaw = np.arange(yaw_bins) * (se2.TWO_PI / yaw_bins)
+        mesh = np.stack([axis.ravel() for axis in np.meshgrid(x, y, yaw)], axis=1)
+        return LikelihoodVolume.from_scores(self.log_density(mesh).reshape(len(y), len(x), yaw_bins), self.grid)
 
     def log_density(self, poses: ArrayLike) -> FloatArray:
         """ln density (N,) at poses (N, 3), yaw residuals wrapped."""

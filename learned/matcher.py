@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.errors import SkyfixError
+from fusion.gaussian_likelihood import GaussianLikelihood
 from fusion.grid import MapGrid
 from fusion.likelihood import LikelihoodVolume
+from fusion.location_orientation import LocationOrientationMaps
 from learned.map_raster import MapRaster
 
 _NAMES = ("rotmatch", "pooled", "geometric")
@@ -60,7 +62,7 @@ class MapMatcher(Protocol):
 
     def match(
         self, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
-    ) -> LikelihoodVolume:
+    ) -> LikelihoodVolume | LocationOrientationMaps | GaussianLikelihood:
         """Likelihood of the poses in the search region given one scan.
 
         Parameters
@@ -80,17 +82,6 @@ class MapMatcher(Protocol):
             If the scan is empty or not finite, or the map lacks what the matcher needs.
         """
         ...
-
-
-def match_scan(
-    matcher: MapMatcher, points: NDArray[np.float32], ground_z: float, map_raster: MapRaster, search: SearchRegion
-) -> LikelihoodVolume:
-    """A matcher's answer, see `MapMatcher.match`; SkyfixError if one of the user's own answers with anything else."""
-    answer: object = matcher.match(points, ground_z, map_raster, search)
-    if not isinstance(answer, LikelihoodVolume):
-        kind = type(answer).__name__
-        raise SkyfixError(f"matcher {matcher.name}: expected match() to answer with a LikelihoodVolume, got {kind}")
-    return answer
 
 
 @runtime_checkable

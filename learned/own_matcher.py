@@ -9,12 +9,12 @@ import importlib
 import importlib.util
 import math
 import sys
-import traceback
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
 from fusion.errors import SkyfixError
+from learned.answers import failure_line
 from learned.matcher import MapMatcher
 
 _MEMBERS = ("name", "error_correlation_length_m", "match")
@@ -78,7 +78,8 @@ def _imported(own: OwnMatcher) -> ModuleType:
     try:
         return _from_file(path.resolve()) if own.is_file else importlib.import_module(own.source)
     except (Exception, SystemExit) as error:
-        raise _failed(own, "imported", error) from error
+        file = str(path.resolve()) if own.is_file else None
+        raise SkyfixError(f"matcher {own.label}: cannot be imported: {failure_line(error, file)}") from error
 
 
 def _from_file(path: Path) -> ModuleType:
@@ -102,13 +103,5 @@ def _made(module: ModuleType, own: OwnMatcher) -> Any:
     try:
         return maker()
     except Exception as error:
-        raise _failed(own, "made without arguments", error) from error
-
-
-def _failed(own: OwnMatcher, what: str, error: BaseException) -> SkyfixError:
-    """One line that says where it went wrong."""
-    stack = traceback.extract_tb(error.__traceback__)
-    frames = [frame for frame in stack if frame.filename != __file__ and not frame.filename.startswith("<")]
-    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    return SkyfixError(f"matcher {own.label}: cannot be {what}: {reason}{where}")
+        reason = failure_line(error, module.__file__)
+        raise SkyfixError(f"matcher {own.label}: cannot be made without arguments: {reason}") from error

@@ -18,9 +18,10 @@ from fusion import se2
 from fusion.arrays import FloatArray
 from fusion.errors import SkyfixError
 from fusion.likelihood import LikelihoodVolume
+from learned.answers import match_scan
 from learned.checkpoint import load_checkpoint
 from learned.map_raster import MapRaster
-from learned.matcher import MapMatcher, SearchRegion, error_correlation_length_m, largest_half_extent_m, match_scan
+from learned.matcher import MapMatcher, SearchRegion, error_correlation_length_m, largest_half_extent_m
 from learned.rotmatch import RotMatch
 from learned.whole_map import WholeMapMatcher, WholeMapSearch
 

@@ -20,9 +20,10 @@ from fusion.arrays import Float32Array, FloatArray
 from fusion.errors import SkyfixError
 from fusion.likelihood import LikelihoodVolume
 from fusion.trajectory import Trajectory
+from learned.answers import match_scan
 from learned.calibration import Calibration, sample_map
 from learned.map_raster import MapRaster
-from learned.matcher import MapMatcher, SearchRegion, match_scan
+from learned.matcher import MapMatcher, SearchRegion
 from learned.network import NetworkMatcher
 from learned.samples import Sample
 from sequences.drive import STAMP_TOLERANCE_NS

@@ -17,7 +17,8 @@ from fusion.odometry import OdometryIncrement, accumulate
 from fusion.particle_filter import ParticleFilter
 from fusion.prior import UniformPrior
 from fusion.two_level import TwoLevelLikelihood
-from learned.matcher import MapMatcher, error_correlation_length_m, largest_half_extent_m, match_scan
+from learned.answers import match_scan
+from learned.matcher import MapMatcher, error_correlation_length_m, largest_half_extent_m
 from sequences.anywhere import Predicted
 from sequences.anywhere_search import AnywhereSearch
 from sequences.drive import Drive

@@ -7,12 +7,16 @@ import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import skyfix
 from made_drive import MadeDrive
 
+from fusion import GaussianLikelihood, MapGrid
 from fusion.errors import SkyfixError
-from learned.matcher import load_matcher
+from learned.answers import match_scan
+from learned.map_raster import MapRaster
+from learned.matcher import SearchRegion, load_matcher
 from learned.own_matcher import OwnMatcher, own_matcher_named
 from sequences.evaluation_tables import matcher_labels
 from sequences.sweep_plan import matcher_label
@@ -23,9 +27,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from beside import sigma_m
 from made_drive import EmulatedMatcher
 
+from fusion import GaussianLikelihood, LikelihoodVolume, LocationOrientationMaps, MapGrid
 from sequences.trajectory_io import read_tum
 
 
@@ -66,10 +72,44 @@ class Endless(Nothing):
     match = None
 
 
+class Failing(Nothing):
+    def match(self, *arguments):
+        return {}["weights"]
+
+
+class Elsewhere(Nothing):
+    def match(self, *arguments):
+        return LikelihoodVolume.from_scores(np.zeros((20, 20, 8)), MapGrid(20, 20, 1.0, 990.0, 990.0))
+
+
+class Unnormalised(Nothing):
+    def match(self, points, ground_z, map_raster, search):
+        return LikelihoodVolume.from_scores(np.full((20, 20, 8), np.nan), MapGrid(20, 20, 1.0, 0.0, 0.0))
+
+
+class Pose(Nothing):
+    def match(self, points, ground_z, map_raster, search):
+        grid = map_raster.grid.window(search.centre[:2], search.half_extent_m)
+        return GaussianLikelihood([4.0, 3.0, 0.5], np.diag([1.0, 2.0, 0.04]), grid)
+
+
+class Maps(Pose):
+    def match(self, *arguments):
+        volume = super().match(*arguments).to_volume(90)
+        step = 2 * np.pi / 90
+        location = np.logaddexp.reduce(volume.log_prob, axis=2) + np.log(step)
+        orientation = np.moveaxis(volume.log_prob - location[:, :, None], 2, 0)
+        return LocationOrientationMaps(location, orientation, volume.grid)
+
+
 class Nameless(Nothing):
     name = ""
     match = None
 """
+
+
+CITY = MapGrid(100, 100, 0.5, -20.0, -20.0)
+BARE = MapRaster.from_classes(CITY, np.zeros((100, 100), dtype=np.uint8))
 
 
 @pytest.fixture
@@ -170,6 +210,30 @@ def test_a_runtime_is_for_skyfix_own_networks(file: Path) -> None:
     pytest.importorskip("onnxruntime")
     with pytest.raises(SkyfixError, match="backend onnxruntime: expected rotmatch or a checkpoint of it, got mine"):
         load_matcher(f"{file}:Mine", "onnxruntime")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Failing", r"matcher nothing: match\(\) failed: KeyError: 'weights' \(network.py, line \d+\)$"),
+        ("Elsewhere", "matcher nothing: expected an answer about x 3 y 4, got one about x 1000 y 1000$"),
+        ("Unnormalised", "scores: expected finite values at the valid cells, got NaN or an infinity"),
+    ],
+)
+def test_an_answer_of_no_use_is_one_line(file: Path, name: str, message: str) -> None:
+    search = SearchRegion(np.array([3.0, 4.0, 0.0]), 10.0)
+    with pytest.raises(SkyfixError, match=message):
+        match_scan(load_matcher(f"{file}:{name}"), np.zeros((1, 4), np.float32), -1.7, BARE, search)
+
+
+@pytest.mark.parametrize("name", ["Pose", "Maps"])
+def test_a_pose_with_a_covariance_and_maps_will_do_as_answers(file: Path, name: str) -> None:
+    search = SearchRegion(np.array([3.0, 4.0, 0.0]), 10.0)
+    volume = match_scan(load_matcher(f"{file}:{name}"), np.zeros((1, 4), np.float32), -1.7, BARE, search)
+    mean, covariance = np.array([4.0, 3.0, 0.5]), np.diag([1.0, 2.0, 0.04])
+    near = np.random.default_rng(0).multivariate_normal(mean, covariance, 200)
+    expected = GaussianLikelihood(mean, covariance, volume.grid).log_density(near)
+    np.testing.assert_allclose(volume.log_density(near), expected, atol=0.06)  # interpolated between cells
 
 
 @pytest.mark.parametrize(("command", "code"), [("track", 2), ("evaluate", 2), ("check", 1)])
