@@ -20,8 +20,8 @@ from fusion.errors import SkyfixError
 from fusion.odometry_limits import MotionKind
 from fusion.trajectory import Trajectory
 from learned.matcher import MapMatcher
+from sequences.check_matching import FEWEST_RIGHT, RIGHT_M, explanation, shots_of
 from sequences.drive import load_drive
-from sequences.evaluate import evaluate_single_shot
 from sequences.ground_height import estimate_ground_z
 from sequences.metrics import from_true_start, position_errors, scored
 from sequences.sequence import Sequence, odometry_is_emulated, origin_of
@@ -34,7 +34,6 @@ _COURSE_STEP_M, _COURSE_LEAST, _COURSE_OFF_RAD, _COURSE_SPREAD = 2.0, 5, np.deg2
 _SCALE_OFF, _SHORT_M = 0.1, 10.0
 _MANY_JUMPS = 0.05  # of an odometry's samples
 _LEAST_TURN_RAD = 0.5
-_FEWEST_RIGHT, _RIGHT_M = 0.5, 3.0
 
 
 class Level(StrEnum):
@@ -202,7 +201,9 @@ def _against_truth(subject: str, truth: Trajectory, odometry: Trajectory) -> lis
     drift = f"begun at the true pose {off_m.mean():.1f} m off on average, {off_m[-1]:.1f} m at the end"
     text = f"{ratio:.3f} of the true length; {drift}"
     fits = abs(ratio - 1.0) <= _SCALE_OFF
-    findings = [Finding(Level.OK if fits else Level.PROBLEM, subject, text + ("" if fits else ": is it in metres?"))]
+    if not fits:
+        return [Finding(Level.PROBLEM, subject, f"{text}: is it in metres, its times in seconds?")]
+    findings = [Finding(Level.OK, subject, text)]
     if _turn_opposed(*(np.diff(each.poses[:, 2]) for each in (odometry, truth))):
         text = "turns the other way than the truth: expected y to the left, yaw counter-clockwise"
         findings.append(Finding(Level.PROBLEM, subject, text))
@@ -244,14 +245,18 @@ def _stops(poses: FloatArray) -> list[int]:
 
 def _matching(sequence: Sequence, matcher: MapMatcher) -> list[Finding]:
     protocol = ShotProtocol(max_frames=SCANS_LOOKED_AT)
-    found = evaluate_single_shot(sequence, {matcher.name: matcher}, protocol)["methods"][matcher.name]
-    right = found["position_recall"][f"{_RIGHT_M:g}"]
+    shots = shots_of(sequence, protocol)
+    found, off_m = shots.errors(matcher)
+    off_deg, right = np.rad2deg(np.abs(se2.wrap(found[:, 2] - shots.truth[:, 2]))), float(np.mean(off_m < RIGHT_M))
     text = (
-        f"{found['frames']} scans matched by {matcher.name} from ±{protocol.half_extent_m:g} m, "
-        f"±{protocol.half_heading_deg:g}°: median {found['position_error_m']['median']:.1f} m and "
-        f"{found['heading_error_deg']['median']:.1f}° off, {100 * right:.0f} % within {_RIGHT_M:g} m"
+        f"{len(found)} scans matched by {matcher.name} from ±{protocol.half_extent_m:g} m, "
+        f"±{protocol.half_heading_deg:g}°: median {np.median(off_m):.1f} m and {np.median(off_deg):.1f}° off, "
+        f"{100 * right:.0f} % within {RIGHT_M:g} m"
     )
-    return [Finding(Level.OK if right >= _FEWEST_RIGHT else Level.PROBLEM, "matching", text)]
+    if right >= FEWEST_RIGHT:
+        return [Finding(Level.OK, "matching", text)]
+    why = explanation(shots, matcher, found)
+    return [Finding(Level.PROBLEM, "matching", f"{text}; {why}" if why else text)]
 
 
 def _share_covered(sequence: Sequence, trajectory: Trajectory) -> float:

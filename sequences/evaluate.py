@@ -70,7 +70,7 @@ def evaluate_single_shot(
     truth = sequence.ground_truth
     if truth is None:
         raise SkyfixError(f"{sequence.name}: expected ground truth to evaluate against, found none")
-    chosen = _frames(sequence, truth, protocol.max_frames)
+    chosen = frames_with_truth(sequence, truth, protocol.max_frames)
     true_poses = truth.interpolate(sequence.stamps_ns[chosen], STAMP_TOLERANCE_NS)
 
     def shots() -> Iterable[_Shot]:
@@ -213,7 +213,8 @@ def _chance_source(calibration: Calibration | None) -> str:
     return "peak mass" if calibration is None else "calibrated peak mass"
 
 
-def _frames(sequence: Sequence, truth: Trajectory, max_frames: int) -> np.ndarray:
+def frames_with_truth(sequence: Sequence, truth: Trajectory, max_frames: int) -> np.ndarray:
+    """Indices of at most so many scans, evenly, that ground truth covers; SkyfixError if there is none."""
     first, last = truth.span_ns
     stamps = sequence.stamps_ns
     covered = np.flatnonzero((stamps >= first - STAMP_TOLERANCE_NS) & (stamps <= last + STAMP_TOLERANCE_NS))
