@@ -137,7 +137,7 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=path).close()
     except OSError as error:
-        raise SkyfixError(f"training: expected a folder to write to at {path}: {error.strerror}") from error
+        raise SkyfixError(f"{path}: expected a folder to write to: {error.strerror}") from error
 
 
 def _finite_terms(losses: dict[str, Tensor], processes: Processes, step: int) -> dict[str, float]:
