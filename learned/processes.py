@@ -82,9 +82,10 @@ def rows_of_all(rows: Tensor) -> Tensor:
     """
     if not (dist.is_initialized() and torch.is_grad_enabled()):
         return rows
-    count = dist.get_world_size()
-    parts = [torch.empty_like(rows) for _ in range(count)]
-    dist.all_gather(parts, rows.detach().contiguous())
+    count, own = dist.get_world_size(), rows.detach().cpu().contiguous()  # gloo gathers on the CPU alone
+    gathered = [torch.empty_like(own) for _ in range(count)]
+    dist.all_gather(gathered, own)
+    parts = [part.to(rows.device) for part in gathered]
     if rows.requires_grad:
         parts[dist.get_rank()] = count * rows - (count - 1) * rows.detach()
     return torch.cat(parts)
