@@ -19,7 +19,7 @@ from fusion.trajectory import Trajectory
 
 _HARDEST_M_PER_S2 = 10.0  # braking of a car on a dry road
 _STOPPING_S, _COARSE_M = 0.5, 0.5  # looked at beside a standstill; wheels tell the way in steps
-_REPEATS = 1.5  # times the usual time between two poses that differ
+_REPEATS, _NOW_AND_THEN = 2.0, 0.1  # times the usual time between two poses that differ; share of them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +129,8 @@ class _Steps:
         """All of them, judged by limits that are fitted."""
         deltas = se2.between(odometry.poses[:-1], odometry.poses[1:])
         seconds = 1e-9 * np.diff(odometry.stamp_ns)
-        kinds = tuple(limits.kind(delta, time) for delta, time in zip(deltas, seconds.tolist(), strict=True))
+        judged = np.maximum(seconds, np.median(seconds)).tolist()  # stamps jitter
+        kinds = tuple(limits.kind(delta, time) for delta, time in zip(deltas, judged, strict=True))
         return cls(seconds, np.hypot(deltas[:, 0], deltas[:, 1]), kinds)
 
     def before(self, sample: int) -> slice:
@@ -175,20 +176,27 @@ def _repeats(odometry: Trajectory) -> IntArray:
 
 
 def _without_repeats(odometry: Trajectory, limits: OdometryLimits) -> Trajectory:
-    """Without the samples that repeat a position until the next is computed, where that looks like a jump."""
+    """Without the samples that repeat a position until the next is computed, where that looks like a jump.
+
+    If it does so more than now and then, all short repeats are of that kind.
+    """
     repeats = _repeats(odometry)
     is_new = np.ones(len(odometry), dtype=bool)
     for first, last in repeats.tolist():
         is_new[first + 1 : last + 1] = False
     usual_s = float(np.median(1e-9 * np.diff(odometry.stamp_ns[is_new]))) if is_new.sum() > 1 else 0.0
     short_s, limits = max(limits.gap_s, _REPEATS * usual_s), limits.fitted(odometry)
-    kept = np.ones(len(odometry), dtype=bool)
+    short, jumping = [], []
     for first, last in repeats[repeats[:, 1] < len(odometry) - 1].tolist():
         motion = se2.between(odometry.poses[last], odometry.poses[last + 1])
         held_s, step_s = (1e-9 * np.diff(odometry.stamp_ns[[first, last, last + 1]])).tolist()
         is_jump = [limits.kind(motion, step_s, held) is MotionKind.RESET for held in (0.0, held_s)]
-        if held_s + step_s <= short_s and is_jump == [True, False]:
-            kept[first + 1 : last + 1] = False
+        if held_s + step_s <= short_s:
+            short.append((first, last))
+            jumping += short[-1:] if is_jump == [True, False] else []
+    kept = np.ones(len(odometry), dtype=bool)
+    for first, last in short if len(jumping) > _NOW_AND_THEN * len(short) else jumping:
+        kept[first + 1 : last + 1] = False
     return _only(odometry, kept)
 
 

@@ -145,10 +145,12 @@ class OdometryLimits:
         if len(odometry) < 2:
             return self
         seconds = 1e-9 * np.diff(odometry.stamp_ns)
-        usual_s = float(np.median(seconds))
-        gap_s = max(self.gap_s, _OWN_STEPS * usual_s)
-        seconds_each = np.maximum(seconds, 0.5 * usual_s)  # stamps jitter
-        xy = odometry.poses[:, :2]
+        gap_s = max(self.gap_s, _OWN_STEPS * float(np.median(seconds)))
+        steps_m = np.linalg.norm(np.diff(odometry.poses[:, :2], axis=0), axis=1)
+        is_new = np.concatenate([[True], steps_m >= FROZEN_M_PER_S * seconds])  # speeds are from pose to other pose
+        xy, seconds_each = odometry.poses[is_new, :2], 1e-9 * np.diff(odometry.stamp_ns[is_new])
+        usual_s = float(np.median(seconds_each)) if len(seconds_each) else 0.0
+        seconds_each = np.maximum(seconds_each, 0.5 * usual_s)  # stamps jitter
         speeds = np.linalg.norm(np.diff(xy, axis=0), axis=1) / seconds_each
         in_pairs = np.linalg.norm(xy[2:] - xy[:-2], axis=1) / (seconds_each[1:] + seconds_each[:-1])
         kept_up = float(np.minimum(in_pairs, np.minimum(speeds[1:], speeds[:-1])).max(initial=0.0))

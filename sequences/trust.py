@@ -61,7 +61,8 @@ def trust(
     if gain < least and measured >= _FEWEST:
         doubts.append(
             f"the scans hardly agree with the map where the track is (evidence of {gain:.1f} nats over a random pose, "
-            f"{least:.2g} or more is usual): is it the right map and start, are the scans' axes and units right?"
+            f"{least:.2g} or more is usual): is it the right map and start, are the scans' axes and units right "
+            "(`skyfix check` looks)?"
         )
     if not shows_buildings:
         doubts.append("the map shows no buildings: matching has to guess how far walls stand from the carriageway")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_drive import EmulatedMatcher, MadeDrive
 
@@ -192,6 +192,31 @@ def test_a_slow_odometry_that_is_published_often_goes_on_between_its_poses(speed
     motion, doubts = believed_odometry(held, LIMITS)
     assert str(doubts) == "nothing doubtful"
     assert np.abs(motion.interpolate(smooth.stamp_ns)[:, 0] - smooth.poses[:, 0]).max() <= speed
+
+
+@settings(max_examples=60)
+@given(
+    st.sampled_from([5.0, 10.0, 20.0, 50.0, 200.0]),
+    st.floats(0.0, 1.0),
+    st.floats(1.0, 28.0),
+    st.sampled_from([0.0, 0.1, 0.3]),
+    st.integers(0, 2**32 - 1),
+)
+def test_whatever_a_car_does_is_believed_however_often_it_is_told(published, ratio, speed, jitter, seed):
+    """At most 28 m/s and 6 m/s^2; computed as often as published or down to once a second; stamps jitter."""
+    rng = np.random.default_rng(seed)
+    computed = 1.0 + ratio * (published - 1.0)
+    times = np.arange(round(30 * published)) / published
+    fine = np.arange(0.0, 31.0, 0.005)
+    pushed = np.interp(fine, np.arange(31), np.clip(rng.normal(0.0, 2.0, 31), -6.0, 6.0))
+    way = np.cumsum(0.005 * np.clip(speed + np.cumsum(0.005 * pushed), 0.0, 28.0))
+    known = np.floor(times * computed) / computed if ratio < 1.0 else times
+    stamps = np.round(1e9 * (times + jitter / published * rng.uniform(-1.0, 1.0, len(times)))).astype(np.int64)
+    told = Trajectory(stamps, np.interp(known, fine, way)[:, None] * [1.0, 0.0, 0.0], None, "odometry")
+    motion, doubts = believed_odometry(told, LIMITS)
+    assert doubts.count(MotionKind.RESET) == 0
+    off_m = np.abs(motion.interpolate(stamps)[:, 0] - np.interp(times, fine, way))[times < 30.0 - 2.0 / computed]
+    assert off_m.max() <= 28.0 * (1.0 / computed + 1.5 / published)
 
 
 @given(st.floats(0.0, 0.3), st.integers(0, 2**32 - 1))
