@@ -92,7 +92,8 @@ def check(sequence: Sequence, matcher: MapMatcher | None = None) -> list[Finding
     if not sequence.odometry_names:
         findings.append(Finding(Level.PROBLEM, "odometry", "expected at least one, found none"))
     if matcher is not None and truth is not None and scans:
-        findings += _told("matching", partial(_matching, sequence, matcher))
+        is_truth_fit = all(one.level is not Level.PROBLEM for one in findings if one.subject == "ground truth")
+        findings += _told("matching", partial(_matching, sequence, matcher, is_truth_fit))
     return findings
 
 
@@ -243,7 +244,7 @@ def _stops(poses: FloatArray) -> list[int]:
     return chosen
 
 
-def _matching(sequence: Sequence, matcher: MapMatcher) -> list[Finding]:
+def _matching(sequence: Sequence, matcher: MapMatcher, is_truth_fit: bool) -> list[Finding]:
     protocol = ShotProtocol(max_frames=SCANS_LOOKED_AT)
     shots = shots_of(sequence, protocol)
     found, off_m = shots.errors(matcher)
@@ -255,7 +256,7 @@ def _matching(sequence: Sequence, matcher: MapMatcher) -> list[Finding]:
     )
     if right >= FEWEST_RIGHT:
         return [Finding(Level.OK, "matching", text)]
-    why = explanation(shots, matcher, found)
+    why = explanation(shots, matcher, found) if is_truth_fit else ""
     return [Finding(Level.PROBLEM, "matching", f"{text}; {why}" if why else text)]
 
 

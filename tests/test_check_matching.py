@@ -124,6 +124,15 @@ def test_a_map_elsewhere_is_told_by_how_much(made_drive: MadeDrive) -> None:
     assert (east, north) == (pytest.approx(9.0, abs=0.4), pytest.approx(-7.0, abs=0.4))
 
 
+def test_a_truth_whose_headings_are_wrong_explains_enough(drive: FolderSequence, made_drive: MadeDrive) -> None:
+    backwards = se2.compose(made_drive.truth.poses, np.array([0.0, 0.0, np.pi]))
+    write_tum(made_drive.path / "ground_truth.tum", Trajectory(made_drive.truth.stamp_ns, backwards))
+    write_scans(made_drive, np.diag([-1.0, -1.0, 1.0]))
+    found = matching(FolderSequence(made_drive.path), SeeingMatcher(backwards))
+    assert found.level is Level.PROBLEM
+    assert found.text.endswith("% within 3 m")
+
+
 def test_what_nothing_explains_is_not_explained(made_drive: MadeDrive) -> None:
     write_scans(made_drive, np.eye(3))
     rng = np.random.default_rng(0)
